@@ -32,7 +32,7 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import MARGIN, Problem, Task, minimise_criterion
+from drake_teleop.lab.excitation.optimizer import LIMIT_SHARE, Problem, Task, minimise_criterion
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
@@ -109,7 +109,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda x: MARGIN - evaluate(x).uses},
+            constraints={"type": "ineq", "fun": lambda x: LIMIT_SHARE - evaluate(x).uses},
             options={"maxiter": 1000},
         )
     return best

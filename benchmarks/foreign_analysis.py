@@ -31,7 +31,7 @@ from inverse_kinematics import described
 from stations import ARMS
 
 from drake_teleop.lab.analysis.analyze import (
-    DIRECTIONS,
+    UNIT_VECTORS,
     close_all_loops,
     close_other_directions,
     sampling_of_scenario,
@@ -101,7 +101,7 @@ def station_of(arm: str, models: Path | None) -> Scenario:
 
 def figures(scenario: Scenario) -> dict[str, Any]:
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
-    along, sampling = task_direction(scenario, DIRECTIONS["z"]), sampling_of_scenario(scenario)
+    along, sampling = task_direction(scenario, UNIT_VECTORS["z"]), sampling_of_scenario(scenario)
     free = linearize(scenario, load_estimate=estimate)
     with_hand = hybrid_along(
         close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool

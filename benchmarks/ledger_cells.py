@@ -35,7 +35,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from drake_teleop.common.files import models_dir
-from drake_teleop.lab.comparison.compare_passivity import station_base
+from drake_teleop.lab.comparison.compare_passivity import base_scenario
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm, true_load
@@ -216,7 +216,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     """Return the scenario of a cell without passivity method, and its times."""
     slave, channel = slave_of(drawn.arm), channel_of(drawn.network)
     times = times_of(drawn, sum(mean_delay(line) for line in channel.networks_of_directions()))
-    base = replace(station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
+    base = replace(base_scenario("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
     nominal = NominalSlave(slave)
     tip = nominal.start_tip - [0.0, 0.0, GAP]
     beside = np.array([math.cos(drawn.azimuth), math.sin(drawn.azimuth)])

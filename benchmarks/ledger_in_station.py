@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from drake_teleop.lab.comparison.compare_passivity import station_base
+from drake_teleop.lab.comparison.compare_passivity import base_scenario
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAF_SPRINGS,
     delayed_contact,
@@ -113,7 +113,7 @@ def friction_work(result: SimulationResult, scenario: Scenario) -> NDArray[np.fl
 def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Namespace) -> Cell:
     """Runs one."""
     base = replace(
-        station_base("contact_transition", asked.seed),
+        base_scenario("contact_transition", asked.seed),
         operator__grip=grip,
         force_scaling__sigma=sigma,
         wrist_sensor__ideal=asked.ideal,

@@ -16,7 +16,7 @@ from drake_teleop.lab.analysis.absolute_stability import (
     worst_loads,
 )
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
-from drake_teleop.lab.analysis.linearization import AXES, hybrid_along, linearize
+from drake_teleop.lab.analysis.linearization import COMPONENT_NAMES, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
@@ -84,7 +84,7 @@ def diagrams():
         along = task_direction(scenario, UP)
         estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
         cut = linearize(scenario, load_estimate=estimate)
-        others = [axis for axis in AXES if axis != "z"]
+        others = [axis for axis in COMPONENT_NAMES if axis != "z"]
         system = cut.close_loop(
             [f"operator_wrench.{axis}" for axis in others],
             [f"hand_wrench.{axis}" for axis in others],

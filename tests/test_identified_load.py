@@ -173,7 +173,7 @@ def test_failed_write_leaves_no_file_and_is_no_error(identifications, tmp_path, 
 
 
 def test_oldest_files_are_removed(identifications, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MAX_FILES", 2)
+    monkeypatch.setattr(module, "MAX_CACHED_FILES", 2)
     for seed in range(3):
         identified_load(replace(Scenario(), simulation__seed=seed))
         for path in (tmp_path / "cache").iterdir():

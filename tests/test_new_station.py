@@ -112,7 +112,7 @@ def test_joint_margin_counts_more_than_cube_size():
         best._replace(half=0.03, room=0.9),
         best._replace(half=0.0, room=0.0),
     ]
-    assert max([*worse, best], key=place._merit) is best
+    assert max([*worse, best], key=place._place_merit) is best
 
 
 def turned(rpy, tmp_path):

@@ -19,7 +19,7 @@ from drake_teleop.common.files import (
 )
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
-from drake_teleop.lab.excitation.check import RATE
+from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -173,7 +173,7 @@ def _criterion_text(name: str, robot: Robot) -> str:
 def trajectory_table(found: Excitation) -> pl.DataFrame:
     """Return trajectory.csv: joint motion of one period at 1 kHz, both ends included."""
     period = found.trajectory.period
-    t = np.linspace(0, period, round(period * RATE) + 1)
+    t = np.linspace(0, period, round(period * CHECK_RATE_HZ) + 1)
     columns = {"t": t}
     joints = found.trajectory.evaluate(t)
     for symbol, values in zip(("q", "qd", "qdd"), joints, strict=True):
@@ -212,7 +212,7 @@ def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
     limits = found.robot.limits
     s, omega, alpha = sensor_motion(found.robot, found.trajectory)
     wrench = non_contact_wrench(s, omega, alpha, limits.phi)
-    t = np.arange(len(wrench)) / RATE
+    t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (
         (forces, wrench[:, :3], limits.sensor[0], "N"),
         (torques, wrench[:, 3:], limits.sensor[1], "N m"),

@@ -87,7 +87,7 @@ class LoadIdentification:
 
     @property
     def recursive_against_batch(self) -> float:
-        """Largest difference of both estimates in standard deviations."""
+        """Largest difference of recursive and batch estimate, in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
 
@@ -99,7 +99,7 @@ def slave_arm(scenario: Scenario) -> ArmModel:
 
 
 def true_load(scenario: Scenario) -> Array:
-    """Return (16,): zero sensor offsets, then the true parameters phi of tool and payload."""
+    """Return zero sensor offsets, then the true parameters phi of tool and payload (16,)."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
@@ -204,20 +204,20 @@ def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTr
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         raise DrakeTeleopError(
-            f"it has {len(trajectory.q0)} joints, the arm {robot.arm.num_joints}",
+            f"has {len(trajectory.q0)} joints, but the arm {robot.arm.num_joints}",
             where="trajectory",
             remedy="compute a trajectory for this arm",
         )
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
         raise DrakeTeleopError(
-            f"its period is {trajectory.period:g} s, the simulation lasts {duration:g} s",
+            f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s",
             where="trajectory",
             remedy="set simulation.duration to the period",
         )
     worst = check_trajectory(robot, trajectory)[0]
     if worst.share > 1:
         raise DrakeTeleopError(
-            f"it uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"
+            f"uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"
         )
 
 

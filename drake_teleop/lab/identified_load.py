@@ -26,10 +26,10 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 """Environment variable with the cache folder."""
-MAX_FILES = 2000
+MAX_CACHED_FILES = 2000
 """Maximum number of cached files; each has 5 kB."""
 
-_LIBRARIES = ("drake", "numpy", "scipy", "numba")
+_HASHED_LIBRARIES = ("drake", "numpy", "scipy", "numba")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,7 +97,7 @@ _SOURCES_HASH = _hash_sources(Path(__file__).parents[1], models_dir())
 def _cache_key(before: Scenario, detects: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
-    computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
+    computed_by = [f"{name} {version(name)}" for name in _HASHED_LIBRARIES]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
     models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.model_files()]
     what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
@@ -105,7 +105,7 @@ def _cache_key(before: Scenario, detects: bool) -> str:
 
 
 def write_load(path: Path, load: IdentifiedLoad) -> None:
-    """Write a load into a cache file atomically; remove the oldest files above `MAX_FILES`."""
+    """Write a cache file atomically; remove the oldest files above `MAX_CACHED_FILES`."""
     columns = {
         f"{name}.{field.name}": getattr(part, field.name)
         for name, part in (("load", load.identification), ("floor", load.noise_floor))
@@ -116,7 +116,7 @@ def write_load(path: Path, load: IdentifiedLoad) -> None:
     with whole_file(path, shared=True) as unfinished, unfinished.open("wb") as file:
         np.savez(file, **columns)
     files = [(each.stat().st_mtime_ns, each) for each in path.parent.glob("load-*")]
-    for _, old in sorted(files)[:-MAX_FILES]:
+    for _, old in sorted(files)[:-MAX_CACHED_FILES]:
         old.unlink(missing_ok=True)
 
 

@@ -25,8 +25,8 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_DURING_RUN = "estimated during the run"
-_FINAL_FILES = (
+_ESTIMATED_IN_RUN = "estimated during the run"
+_RESULT_FILES = (
     "sensor_log.parquet",
     "identification.json",
     "overview.png",
@@ -102,7 +102,7 @@ def run_command(
         write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary | session, out)
+        _print_summary(summary | session, out)
     return summary | session
 
 
@@ -112,7 +112,7 @@ def _run_with_log(
     log, scenario_file = out / "log.parquet", out / "scenario.yaml"
     # After an interruption, old files must not look like results of this run.
     remove_log(log)
-    for name in _FINAL_FILES:
+    for name in _RESULT_FILES:
         with wrap_write_errors(out / name):
             (out / name).unlink(missing_ok=True)
     had_scenario = scenario_file.exists()
@@ -157,9 +157,9 @@ def run_scenario(
     if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
-            scenario, found.result, found.identification, _DURING_RUN, found.real_time_factor
+            scenario, found.result, found.identification, _ESTIMATED_IN_RUN, found.real_time_factor
         )
-    identification, estimate, floor, source = None, None, None, _DURING_RUN
+    identification, estimate, floor, source = None, None, None, _ESTIMATED_IN_RUN
     with show_progress(progress) as stage:
         if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
@@ -186,7 +186,7 @@ def _describe_log(log: Path) -> str:
     return f"{log} contains the {len(SimulationResult.scan_parquet(log).t)} samples until then"
 
 
-def _print(summary: dict[str, Any], out: Path) -> None:
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -45,11 +45,11 @@ class ScenarioRun:
 
 
 def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return true contact (N,); gaps shorter than `FILTER_TAIL_S` are closed."""
+    """Return whether each sample (N,) is in contact; gaps below `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
-    touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL_S
+    touch = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_TAIL_S
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
@@ -68,8 +68,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     calculated = calculated_contact_wrench(result)
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
-    free = _time_since(contact, result.t) > FILTER_TAIL_S
-    free &= _time_until(contact, result.t) > FILTER_TAIL_S
+    free = _since_contact_s(contact, result.t) > FILTER_TAIL_S
+    free &= _until_contact_s(contact, result.t) > FILTER_TAIL_S
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -82,8 +82,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         **_peak_values("peak_contact", "", calculated),
         **_peak_values("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
-        "joint_speed_use": _largest_use(result["slave_state"][:, n:], arm.velocity_limit),
-        "joint_torque_use": _largest_use(result["joint_torque"], arm.effort_limit),
+        "joint_speed_use": _largest_limit_use(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _largest_limit_use(result["joint_torque"], arm.effort_limit),
         "mass_error_percent": 100 * abs(mass / true_mass - 1),
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
@@ -91,7 +91,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         summary |= _peak_values("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
-    if beyond := _unmodelled_contact(run.scenario):
+    if beyond := _describe_unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
     summary |= _body_displacements(result)
     if run.scenario.operator.task is not None:
@@ -134,7 +134,7 @@ def _detection_figures(
     return summary | {"false_contacts": len(false)}
 
 
-def _unmodelled_contact(scenario: Scenario) -> str:
+def _describe_unmodelled_contact(scenario: Scenario) -> str:
     surroundings = scenario.surroundings
     if surroundings is None:
         return ""
@@ -162,18 +162,18 @@ def _peak_values(prefix: str, suffix: str, wrench: Array) -> dict[str, float | N
     return {name: float(norm) for name, norm in zip(names, norms, strict=True)}
 
 
-def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
+def _since_contact_s(contact: NDArray[np.bool_], t: Array) -> Array:
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
 
 
-def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
-    return _time_since(contact[::-1], -t[::-1])[::-1]
+def _until_contact_s(contact: NDArray[np.bool_], t: Array) -> Array:
+    return _since_contact_s(contact[::-1], -t[::-1])[::-1]
 
 
 def _mass_and_com(phi: Array) -> tuple[float, Array]:
     return float(phi[0]), phi[1:4] / phi[0]
 
 
-def _largest_use(values: Array, limit: Array) -> float:
+def _largest_limit_use(values: Array, limit: Array) -> float:
     return float(np.max(np.abs(values) / limit))

@@ -104,8 +104,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the mass of"
-            " the arm is unbounded in directions in which it cannot move",
+            f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the mass"
+            " of the arm is unbounded in directions in which it cannot move",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )

@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.linearization import (
-    AXES,
+    COMPONENT_NAMES,
     Linearization,
     hybrid_along,
     linearize,
@@ -221,7 +221,7 @@ def test_sideways_tip_compliance_includes_the_hands_wrist():
     scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     system = wired(linearize(scenario, load_estimate=true_load(scenario)))
-    others = [axis for axis in AXES if axis != "x"]
+    others = [axis for axis in COMPONENT_NAMES if axis != "x"]
     operator, hand = (
         [f"{port}.{a}" for a in others] for port in ("operator_wrench", "hand_wrench")
     )

@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison import compare_passivity as study
 from drake_teleop.lab.comparison import delayed_contact
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
-from drake_teleop.lab.comparison.report import COLUMNS, table_cells
+from drake_teleop.lab.comparison.report import RUN_COLUMNS, run_cells
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.environment.solids import Wall
@@ -28,10 +28,10 @@ pytestmark = pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "WALLS", (5100.0,))
-    monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
+    monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
+    monkeypatch.setattr(study, "NETWORK_IMPAIRMENTS", ((0.0, 0.0),))
     monkeypatch.setattr(study, "LEAF_SPRINGS", {"contact": study.LEAF_SPRINGS["contact"]})
-    monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
+    monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
     )
@@ -62,7 +62,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     assert 0.0 <= runs["tdpa"]["left_behind"] == abs(runs["tdpa"]["drift"]) < 0.5e-3
     # A run that is not at rest in its hold ends there.
     assert runs["none"]["left_behind"] is None is runs["none"]["drift"]
-    assert table_cells(runs["none"])[[key for key, *_ in COLUMNS].index("left_behind")] == "–"
+    assert run_cells(runs["none"])[[key for key, *_ in RUN_COLUMNS].index("left_behind")] == "–"
     assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
     # Taps leak, the press does not.
     assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
@@ -80,8 +80,8 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     # All columns are seen in a window of 1200 px, of which the page takes 944: a letter has about
     # 8.5 px, and a column 11 px to its neighbour. Headings take as many lines as they have words.
     assert re.search(r"\nth\.number {[^}]*white-space: normal", page)
-    rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in COLUMNS)]]
-    rows += [["four_channel", "yes", *table_cells(row)] for row in summary["station"]]
+    rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in RUN_COLUMNS)]]
+    rows += [["four_channel", "yes", *run_cells(row)] for row in summary["station"]]
     words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
     assert page.split("</thead>")[0].count("<th") - 1 == len(words)  # <thead> is one of them
     assert sum(8.5 * letters + 11 for letters in words) < 944
@@ -113,9 +113,9 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     monkeypatch.setattr(
         study, "_run_parallel", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
     )
-    study._station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
+    study._run_station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]
-    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RATES)
+    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RUN_RATES)
     assert base.surroundings is None and base.contact_detection is None
     # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"
@@ -131,8 +131,8 @@ def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):
         raise DrakeTeleopError("no", where="here", remedy="none")
 
     monkeypatch.setattr(study, "MakeTeleopStation", refuse)
-    base = study.station_base("contact_transition", 0)
-    row, shown = study.station_run(base, "tdpa", "lan", "stiff contact", np.zeros(16))
+    base = study.base_scenario("contact_transition", 0)
+    row, shown = study.simulate_press(base, "tdpa", "lan", "stiff contact", np.zeros(16))
     assert asked[0].sheet_spring.slip == Wall().slip
     assert (row["stable"], shown) == (False, {}) and "no" in row["error"]
 

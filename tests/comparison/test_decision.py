@@ -6,7 +6,7 @@ import pytest
 
 from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
-from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_runs
+from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_force_traces
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
@@ -77,7 +77,7 @@ def test_letting_go_accelerates_the_device_without_a_method():
     assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
 
 
-@pytest.mark.parametrize("draw", [draw_runs, draw_energy])
+@pytest.mark.parametrize("draw", [draw_force_traces, draw_energy])
 def test_title_of_a_figure_with_one_network_fits(draw):
     figure = draw({"methods": ["none"], "networks": ["lan"]}, {})
     figure.draw_without_rendering()

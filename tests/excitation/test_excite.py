@@ -25,7 +25,7 @@ from drake_teleop.lab.excitation import excite as excite_module
 from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
 from drake_teleop.lab.excitation.limits import (
-    LIMITS,
+    LIMIT_NAMES,
     empty_motions,
     write_link_motions,
     write_sensor_motion,
@@ -118,7 +118,7 @@ def test_executed_motion_respects_the_limits(slave):
     # The control follows the trajectory with a lag.
     assert 0.01 < np.abs(q - asked).max() < 0.2
     uses = check_motion(slave, t, q, qd, np.gradient(qd, t, axis=0))
-    assert len(uses) == len(LIMITS)
+    assert len(uses) == len(LIMIT_NAMES)
     assert all(use.share < 0.995 for use in uses)
     # Torque of the motors, and samples of the sensor.
     limits, wrench = slave.limits, found.result["measured_wrench_S"]
@@ -344,9 +344,9 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
     with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
         identify_load(scenario, trajectory=short.trajectory)
     fitting = replace(scenario, simulation__duration=2.4)
-    with pytest.raises(DrakeTeleopError, match=r"trajectory: it uses 1\d\d\.\d% of its"):
+    with pytest.raises(DrakeTeleopError, match=r"trajectory: uses 1\d\d\.\d% of the"):
         identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
-    with pytest.raises(DrakeTeleopError, match="it has 5 joints, the arm 6"):
+    with pytest.raises(DrakeTeleopError, match="has 5 joints, but the arm 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 
@@ -574,7 +574,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
         (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits, but 6 joints"),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
-        (["--sensor-frame", "l6", "--payload", "0.1"], "already contains 0.9 kg beyond the sensor"),
+        (["--sensor-frame", "l6", "--payload", "0.1"], "model contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
         (["--sensor-frame", "l0"], "no moving joint"),
         ([], "--sensor-frame"),

@@ -13,19 +13,19 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation.criteria import (
     CRITERIA,
     Criterion,
-    Scales,
+    CriterionScales,
     characteristic_length,
 )
 from drake_teleop.lab.excitation.limits import (
-    CLEARANCE_SCALE,
-    LIMITS,
+    CLEARANCE_SCALE_M,
+    LIMIT_NAMES,
     Limits,
     capsule_distances,
     empty_motions,
     write_limit_uses,
     write_link_motions,
 )
-from drake_teleop.lab.excitation.optimizer import Problem, Task, _Search
+from drake_teleop.lab.excitation.optimizer import Problem, Task, _DescentSearch
 from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
@@ -36,7 +36,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 
 PHI = phi_from_mass_com_inertia(3.0, [0.01, -0.02, 0.08], np.diag([0.012, 0.0115, 0.0045]))
-SCALES = Scales((0.3, 0.02), 0.07, PHI)
+SCALES = CriterionScales((0.3, 0.02), 0.07, PHI)
 
 
 def motion(samples: int, seed: int = 0) -> np.ndarray:
@@ -174,7 +174,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     x = problem.candidate(np.random.default_rng(0), near_home=True)
     gradients = problem.evaluate(x, 3.0, 5.0).gradients
     scale = np.abs(gradients).max(axis=1)
-    assert np.all(scale > 1e-3), LIMITS
+    assert np.all(scale > 1e-3), LIMIT_NAMES
     step = 1e-6
     for k, unit in enumerate(np.eye(len(x))):
         ahead, behind = (problem.evaluate(x + sign * step * unit, 3.0, 5.0) for sign in (1, -1))
@@ -196,13 +196,13 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)
     capsules = limits.capsule_row, limits.capsule_ends, limits.capsule_radius, limits.pairs
     distances = capsule_distances(motions, *capsules)
-    found = dict(zip(LIMITS, largest, strict=True))
+    found = dict(zip(LIMIT_NAMES, largest, strict=True))
     for name, expected in {
         "position": np.abs(q - limits.q_middle) / limits.q_half,
         "velocity": np.abs(qd) / limits.velocity,
         "acceleration": np.abs(qdd) / limits.acceleration,
         "workspace": np.abs(points - limits.box_middle) / limits.box_half,
-        "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE,
+        "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE_M,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
     # A use of 1 is the minimum distance.
@@ -240,7 +240,7 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
             log_criterion=0.01 * x[0], uses=np.full(2, uses.get(x[0], 0.9))
         ),
     )
-    search = _Search(problem, 1, None, lambda *_: None)
+    search = _DescentSearch(problem, 1, None, lambda *_: None)
     followed = search.candidates(np.random.default_rng(0))
     assert [int(next(followed)[0]) for _ in range(8)] == list(range(1, 9))
 
@@ -253,7 +253,7 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
         value=lambda: next(values),
         trajectory=lambda x: int(x[0]),
     )
-    search = _Search(problem, 9, None, lambda *_: None)
+    search = _DescentSearch(problem, 9, None, lambda *_: None)
     search.start = 7
     for k in range(4):
         search._evaluate_once(np.array([float(k)]), 3.0, 5.0)

@@ -77,7 +77,7 @@ def test_only_found_and_reported_values_agree():
 def test_unreported_values_never_agree():
     for origin in ("set", "found"):
         row = Comparison("Mass", "not reported", "0.1 %", origin, "at most 0.2 %", True)
-        assert (row.verdict, row.pill) == ("within our bound", "")
+        assert (row.verdict, row.css_class) == ("within our bound", "")
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_unreported_values_never_agree():
 )
 def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdict, tmp_path):
     wrong = SUMMARY | {name: value}
-    (row,) = (row for row in compare_with_paper(wrong) if row.pill == "differs")
+    (row,) = (row for row in compare_with_paper(wrong) if row.css_class == "differs")
     assert what in row.what
     assert row.verdict == verdict
     page = write(tmp_path / "report.html", wrong)

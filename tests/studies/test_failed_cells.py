@@ -25,8 +25,8 @@ from drake_teleop.lab.studies.level_model import (
     NO_RUN,
     NO_SUCCESS,
     NOT_COMPARABLE,
+    fit_level_model,
     largest_complete_block,
-    level_model,
     missing_value_reasons,
 )
 
@@ -181,7 +181,7 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(6)
     known = points[:, 0] - points[:, 1] < 0.4
     value = np.exp(3 * (points[:, 0] - points[:, 1]))[:, None]
-    model = level_model(factors, points.T.tolist(), known)
+    model = fit_level_model(factors, points.T.tolist(), known)
     kept, over, terms = model.comparable_levels(0)
     assert kept.all() and 1 <= over.sum() < 5
     means = model.means(value[known], terms)[0]

@@ -9,7 +9,7 @@ from scipy.stats import qmc
 
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import effects_table, main_effects, pair_means
-from drake_teleop.lab.studies.level_model import level_model, levels_of
+from drake_teleop.lab.studies.level_model import assign_levels, fit_level_model
 
 UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)
@@ -46,7 +46,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
         table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
         table = table + random.normal(0, noise, table.shape)
         known_there = ~(corner & (points[:, 0] > 0.6) & (points[:, 1] < 0.4))
-        model = level_model(UNIT, points.T.tolist(), known_there)
+        model = fit_level_model(UNIT, points.T.tolist(), known_there)
         found, halves = model.effects(table[known_there])
         near = [
             len(a) == len(b) and np.all(np.abs(a - b) <= h)
@@ -153,4 +153,4 @@ def test_too_few_points_give_no_effects():
 
 def test_words_without_run_are_not_levels():
     factor = Factor("a.w", words=["a", "b", "c"])
-    assert levels_of(factor, ["c", "a", "c"]).names == ["a", "c"]
+    assert assign_levels(factor, ["c", "a", "c"]).names == ["a", "c"]

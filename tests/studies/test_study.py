@@ -588,16 +588,19 @@ def test_preset_as_factor_sets_its_values():
         (("[0, 0.5, 1]", "[0, -0.5]"), "factors[0].force_scaling.sigma: -0.5"),
         (("[light, firm]", "[light, iron]"), "factors[1].operator.grip: 'iron' is not known"),
         (("words", "values"), "factors[1].values[0]: expected a number"),
-        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: its values are ambiguous"),
-        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: its values are ambiguous"),
+        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: has no values, or several"),
+        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: has no values, or several"),
         (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: 0 is not above low"),
-        (("[0, 0.5, 1]", "[0, .inf]"), "factors[0]: its numbers, or their range, are not finite"),
-        (("[0, 0.5, 1]", "[.nan]"), "factors[0]: its numbers"),
-        (("values: [0, 0.5, 1]", "vectors: [[0, .inf]]"), "factors[0]: its numbers"),
-        (("values: [0, 0.5, 1]", "low: 0, high: .inf"), "factors[0]: its numbers"),
-        (("values: [0, 0.5, 1]", "low: -.inf, high: .inf"), "factors[0]: its numbers"),
-        (("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"), "factors[0]: its numbers"),
-        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value is repeated"),
+        (("[0, 0.5, 1]", "[0, .inf]"), "factors[0]: has numbers, or a range, that are not finite"),
+        (("[0, 0.5, 1]", "[.nan]"), "factors[0]: has numbers, or a range"),
+        (("values: [0, 0.5, 1]", "vectors: [[0, .inf]]"), "factors[0]: has numbers, or a range"),
+        (("values: [0, 0.5, 1]", "low: 0, high: .inf"), "factors[0]: has numbers, or a range"),
+        (("values: [0, 0.5, 1]", "low: -.inf, high: .inf"), "factors[0]: has numbers, or a range"),
+        (
+            ("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"),
+            "factors[0]: has numbers, or a range",
+        ),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: repeats the value 1.0"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
         (
             ("force_scaling.sigma", "simulation.seed"),
@@ -613,7 +616,7 @@ def test_preset_as_factor_sets_its_values():
         (("repeats: 2", "measures: [hand_work]"), "did you mean 'hand_work_J'"),
         (("repeats: 2", "design: adaptive"), "objective: '' cannot be the objective"),
         (("repeats: 2", "objective: hand_work_J"), "cannot be the objective of design 'factorial'"),
-        ((STUDY, "scenario: tiny.yaml"), "factors: there are no factors"),
+        ((STUDY, "scenario: tiny.yaml"), "factors: is empty (a study varies"),
         ((STUDY, "- 1"), "expected a mapping"),
     ],
 )
@@ -643,7 +646,10 @@ def test_too_large_study_is_refused_before_its_design(files, tmp_path, monkeypat
     fields = [f"{{field: a.b{k}, low: 0, high: 1, levels: 1000}}" for k in range(factors)]
     path = files / "huge.yaml"
     path.write_text(f"factors: [{', '.join(fields)}]\nrepeats: 1000000")
-    with pytest.raises(DrakeTeleopError, match=re.escape(f"huge.yaml: {runs} are too many; give")):
+    with pytest.raises(
+        DrakeTeleopError,
+        match=re.escape(f"huge.yaml: {runs} are too many (at most 1,000,000); give"),
+    ):
         study_command(path, tmp_path / "out", yes=True)
     assert not (tmp_path / "out").exists()
 
@@ -660,7 +666,7 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "501"))
     with pytest.raises(
         DrakeTeleopError,
-        match=r"many\.yaml: 100,200 runs need a confirmation; confirm them by --yes",
+        match=r"many\.yaml: 100,200 runs need your consent; confirm them by --yes",
     ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
-    PARETO,
+    PARETO_MEASURES,
     effects_table,
     estimate_means,
     is_on_pareto_front,
@@ -18,7 +18,7 @@ from drake_teleop.lab.studies.effects import (
 )
 from drake_teleop.lab.studies.pictures import write_pictures
 
-MEASURES = ["success", *PARETO]
+MEASURES = ["success", *PARETO_MEASURES]
 STUDY = Study(
     factors=[
         Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0]),
@@ -40,7 +40,7 @@ def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
         row["task_time_s"] = 1.0 + sigma + noise.normal(0, 0.1)
         row["contact_force_overshoot_N"] = 3.0
         if row["point"] == failing:
-            row |= dict.fromkeys(PARETO)
+            row |= dict.fromkeys(PARETO_MEASURES)
     return pl.DataFrame(rows)
 
 

@@ -155,9 +155,9 @@ def test_settings_change_method_scales_and_filter_alone():
 
 @pytest.mark.long
 def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path, monkeypatch):
-    monkeypatch.setattr(search, "METHODS", ("ledger", "wave"))
-    monkeypatch.setattr(search, "SIGMAS", (0.0,))
-    monkeypatch.setattr(search, "_LOW_PASSES", ())
+    monkeypatch.setattr(search, "CANDIDATE_METHODS", ("ledger", "wave"))
+    monkeypatch.setattr(search, "CANDIDATE_SIGMAS", (0.0,))
+    monkeypatch.setattr(search, "_LOW_PASSES_HZ", ())
     monkeypatch.setattr(search, "_BISECTION_RATIO", 2.0)
     arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
     summary = tune("touch", tmp_path, progress=False, **arguments)

@@ -1,4 +1,4 @@
-"""Stability with any passive hand and environment, or with those in given ranges.
+"""Stability of a station with any passive hand and environment, or with those in given ranges.
 
 H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
@@ -18,76 +18,77 @@ from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_imped
 if TYPE_CHECKING:
     pass
 
-Real = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+RealArray = NDArray[np.float64]
+BooleanArray = NDArray[np.bool_]
 
-_ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
+_ROUNDING_TOLERANCE = 1e-12  # relative to the terms that cancel in a criterion
 
 
-def llewellyn_criterion(H: Complex) -> Real:
+def llewellyn_criterion(H: Complex) -> RealArray:
     """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
 
-def llewellyn_parameter(H: Complex) -> Real:
+def llewellyn_parameter(H: Complex) -> RealArray:
     """Return Llewellyn's parameter; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 + llewellyn_criterion(H) / product
 
 
-def is_absolutely_stable(H: Complex) -> Flags:
-    """Return where the station is stable with any passive hand and wall."""
+def is_absolutely_stable(H: Complex) -> BooleanArray:
+    """Return, for each frequency of H, whether it is stable with any passive hand and wall."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
-        (h11.real >= -_ROUNDING * np.abs(h11))
-        & (h22.real >= -_ROUNDING * np.abs(h22))
-        & (llewellyn_criterion(H) >= -_ROUNDING * size)
+        (h11.real >= -_ROUNDING_TOLERANCE * np.abs(h11))
+        & (h22.real >= -_ROUNDING_TOLERANCE * np.abs(h22))
+        & (llewellyn_criterion(H) >= -_ROUNDING_TOLERANCE * size)
     )
 
 
-def required_damping(H: Complex) -> Real:
-    """Return the additional device damping [N s/m] for absolute stability; inf: none suffices."""
+def required_damping(H: Complex) -> RealArray:
+    """Return the additional device damping [N s/m] for absolute stability; inf: impossible."""
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
-    loss = np.where(loss <= _ROUNDING * np.abs(product), 0.0, loss)
+    loss = np.where(loss <= _ROUNDING_TOLERANCE * np.abs(product), 0.0, loss)
     with np.errstate(divide="ignore", invalid="ignore"):
         through = np.where(loss > 0, loss / (2 * h22.real), 0.0)
     return np.where(h22.real < 0, np.inf, through) - h11.real
 
 
-def raisbeck_criterion(H: Complex) -> Real:
+def raisbeck_criterion(H: Complex) -> RealArray:
     """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
     h11, h12, h21, h22 = matrix_entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
 
-def is_passive(H: Complex) -> Flags:
-    """Return where the station absorbs power for every input."""
+def is_passive(H: Complex) -> BooleanArray:
+    """Return, for each frequency of H, whether the station absorbs power for every input."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
-        (h11.real >= -_ROUNDING * np.abs(h11))
-        & (h22.real >= -_ROUNDING * np.abs(h22))
-        & (raisbeck_criterion(H) >= -_ROUNDING * size)
+        (h11.real >= -_ROUNDING_TOLERANCE * np.abs(h11))
+        & (h22.real >= -_ROUNDING_TOLERANCE * np.abs(h22))
+        & (raisbeck_criterion(H) >= -_ROUNDING_TOLERANCE * size)
     )
 
 
-def scattering_norm(S: Complex) -> Real:
+def scattering_norm(S: Complex) -> RealArray:
     """Return the largest singular value of a scattering matrix; passive if at most 1."""
     return _largest_singular_value(*matrix_entries(S))
 
 
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
-) -> Real:
-    """Return mu of the scattering matrix S for loads with at most these reflection factors (T56).
+) -> RealArray:
+    """Return the structured singular value mu of the scattering matrix S (T56).
 
-    With factors of 1 (any passive load), mu <= 1 means absolutely stable.
+    `hand`, `environment`: largest reflection factors. With 1 (any passive load), mu <= 1 means
+    absolutely stable.
     """
     s11, s12, s21, s22 = matrix_entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
@@ -97,7 +98,7 @@ def structured_singular_value(
     return _largest_singular_value(s11 * r1, turned, even, s22 * r2)
 
 
-def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> Real:
+def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> RealArray:
     determinant = a * d - b * c
     size = np.abs(determinant)
     phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
@@ -107,23 +108,23 @@ def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> R
     return (np.sqrt(sums) + np.sqrt(differences)) / 2
 
 
-def _squared_abs(z: Complex) -> Real:
+def _squared_abs(z: Complex) -> RealArray:
     return z.real**2 + z.imag**2
 
 
 class WorstLoads(NamedTuple):
     """Reactances X [N s/m] of the lossless hand and environment that are closest to oscillation.
 
-    At frequency w, X > 0 is a mass X / w, X < 0 a spring -X w.
+    At w [rad/s], X > 0 is a mass X / w [kg], X < 0 a stiffness -X w [N/m].
     """
 
-    hand: Real
-    environment: Real
-    resistance: Real  #: resistance of the loop; negative: the oscillation grows
+    hand: RealArray
+    environment: RealArray
+    resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
 
 
 def worst_loads(H: Complex) -> WorstLoads:
-    """Return the lossless loads closest to oscillation; Re h22 must not be 0."""
+    """Return the lossless hand and environment closest to oscillation; Re h22 must not be 0."""
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     size = np.abs(product)
@@ -152,8 +153,8 @@ class ImpedanceRange:
                     f"{low} to {high} is no range", where=name, remedy="give (smallest, largest)"
                 )
 
-    def corners(self, omega: Real) -> Complex:
-        """Return the corners (..., 4) [N s/m] in the complex plane, counter-clockwise."""
+    def corners(self, omega: RealArray) -> Complex:
+        """Return the range's corners (..., 4) [N s/m] at omega, counter-clockwise."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
         least, most = self.damping
@@ -161,7 +162,7 @@ class ImpedanceRange:
             [least + 1j * low, most + 1j * low, most + 1j * high, least + 1j * high], -1
         )
 
-    def contains(self, impedance: Complex, omega: Real) -> Flags:
+    def contains(self, impedance: Complex, omega: RealArray) -> BooleanArray:
         corners = self.corners(omega)
         low, high = corners[..., 0], corners[..., 2]
         return (
@@ -186,11 +187,11 @@ def impedance_range_of_grips() -> ImpedanceRange:
 
 
 def can_oscillate(
-    H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
-) -> Flags:
-    """Return where some hand and environment of the ranges oscillate (T57).
+    H: Complex, omega: RealArray, hand: ImpedanceRange, environment: ImpedanceRange
+) -> BooleanArray:
+    """Return, for each omega, whether some hand and environment in the ranges oscillate (T57).
 
-    If all are False on a dense grid, the pairs are all stable or all unstable.
+    If all values on a dense grid are False, all pairs are stable or all are unstable.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
@@ -205,8 +206,8 @@ def can_oscillate(
     return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
 
 
-def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
-    """Return the softest wall [N/m] with which some hand of the range oscillates."""
+def stiffness_limit(H: Complex, omega: RealArray, hand: ImpedanceRange) -> RealArray:
+    """Return, for each omega, the softest wall [N/m] that oscillates with a hand of the range."""
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
@@ -218,10 +219,10 @@ def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
 
 def _edge_crossings(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
-) -> tuple[Real, Real]:
-    # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u; it is zero where
+) -> tuple[RealArray, RealArray]:
+    # Hand z + t dz and wall e + u de oscillate at t, u (nan: never), where
+    # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u is zero, so that
     # t = -(a + c u) / (b + d u) is real.
-    """Return t and u for which hand z + t dz and wall e + u de oscillate, or nan."""
     hand_side, environment_side = z + h11, 1 + h22 * e
     a, b = hand_side * environment_side - product * e, dz * environment_side
     c, d = (hand_side * h22 - product) * de, dz * h22 * de
@@ -235,9 +236,9 @@ def _edge_crossings(
 
 
 def bounded_singular_value(
-    H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
-) -> Real:
-    """Return mu; below 1 no hand and environment of the ranges can oscillate."""
+    H: Complex, omega: RealArray, hand: ImpedanceRange, environment: ImpedanceRange
+) -> RealArray:
+    """Return mu; below 1, no hand and environment in the ranges can oscillate at omega [rad/s]."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
@@ -256,7 +257,7 @@ def bounded_singular_value(
 _DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # offsets of the discs, in half diagonals
 
 
-def _enclosing_discs(corners: Complex) -> tuple[Complex, Real]:
+def _enclosing_discs(corners: Complex) -> tuple[Complex, RealArray]:
     diagonal = corners[..., 2] - corners[..., 0]
     right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS
     middle = corners[..., 0] + 0.5j * diagonal.imag

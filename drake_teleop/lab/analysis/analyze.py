@@ -16,7 +16,7 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linearization import (
-    AXES,
+    COMPONENT_NAMES,
     Linearization,
     close_network,
     hybrid_along,
@@ -33,8 +33,8 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
-DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_LEAF_DEPTH = 5e-3  # m, displacement of the tip into the leaf
+UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_LEAF_DEFLECTION_M = 5e-3  # m, displacement of the tip into the leaf
 
 
 def analyze_command(
@@ -66,16 +66,16 @@ def analyze(
 ) -> tuple[dict[str, Any], Curves]:
     """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
-        return _analyze(scenario, direction, stage)
+        return _analyze_in_stages(scenario, direction, stage)
 
 
-def _analyze(
+def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
 ) -> tuple[dict[str, Any], Curves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
-    along = task_direction(linear, DIRECTIONS[direction])
+    along = task_direction(linear, UNIT_VECTORS[direction])
     sampling = sampling_of_scenario(linear)
     wall = (5100.0, 0.0)
     if along.axis.wall_stiffness > 0.0:
@@ -99,8 +99,8 @@ def _analyze(
     with_hand = hybrid_along(
         close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
     )
-    H = absorb_impedances(with_hand, hand=-figures.S * axis.hand_mass)
-    closed_form = hybrid_matrix(axis, figures.S)
+    H = absorb_impedances(with_hand, hand=-figures.S_AT_OMEGA * axis.hand_mass)
+    closed_form = hybrid_matrix(axis, figures.S_AT_OMEGA)
     progress(0.3)
     summary: dict[str, Any] = {
         "direction": direction,
@@ -172,7 +172,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the displacement of the master [m], in B, that bends the leaf spring by 5 mm."""
+    """Return the master's displacement [m] in its base frame B that bends the leaf by 5 mm."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -182,7 +182,7 @@ def displacement_into_leaf(scenario: Scenario) -> list[float]:
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
     tip = NominalSlave(scenario.slave).start_tip
-    displacement = np.array(scenario.leaf.position) - [0.0, 0.0, _LEAF_DEPTH] - tip
+    displacement = np.array(scenario.leaf.position) - [0.0, 0.0, _LEAF_DEFLECTION_M] - tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)
 
@@ -196,11 +196,11 @@ def close_other_directions(
 ) -> Linearization:
     """Return the model with all loops closed, except the loop of the hand along `along`.
 
-    Along no axis of B, the hand's loop remains open in all directions.
+    If `along` is parallel to no axis of B, the hand's loop remains open in all directions.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
-    others = [axis for k, axis in enumerate(AXES) if len(aligned) and k != aligned[0]]
+    others = [axis for k, axis in enumerate(COMPONENT_NAMES) if len(aligned) and k != aligned[0]]
     return system.close_loop(
         [f"operator_wrench.{axis}" for axis in others], [f"hand_wrench.{axis}" for axis in others]
     )

@@ -1,7 +1,7 @@
-"""Loop of the sampled one-axis model, cut at the displayed force (T60).
+"""Feedback loop of the sampled one-axis model, cut at the displayed force (T60).
 
-The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues over a
-period.
+The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues of
+the map over a period.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampling, cut_period_map
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
-_ANGLES = np.pi * np.logspace(-5, 0, 401)
-_PEAK_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+_SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
+_POLE_ANGLE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _GOLDEN_STEPS = 0.6180339887498949, 25
 _MAX_CROSSINGS = 32
 _MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
 _DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the growth rate, from 1/s
-_UNIT_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
+_UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
 @dataclass(frozen=True)
 class CutLoop:
-    """Loop L(z), from displayed force to displayed force, without the channel's delay."""
+    """Transfer function L(z) of the loop cut at the displayed force, without the channel."""
 
     open: Complex  #: (..., n) multipliers of the cut loop
     closed: Complex  #: (..., n) multipliers of the loop closed without delay
@@ -48,14 +48,14 @@ class CutLoop:
             opened.reshape(-1, n),
             closed.reshape(-1, n),
             np.full(shape, level).ravel(),
-            _ANGLES,
+            _SEARCH_ANGLES_RAD,
             found.reshape(3, -1, _MAX_CROSSINGS),
         )
         return cls(opened, closed, np.broadcast_to(period, shape), *found)
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force; errors as `cut_period_map`."""
+    """Return the loop without delay, cut at the displayed force; raise as `cut_period_map`."""
     M = cut_period_map(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
@@ -66,7 +66,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return the loop response (N, ...) with a one-way `delay` [s]; 1 is the stability limit."""
+    """Return the response (N, ...) at `frequency` [rad/s], `delay` one way [s]; limit: 1."""
     dimensions = max(loop.period.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period)[..., None]
@@ -98,17 +98,17 @@ def _interpolate(value: Array, fraction: Array) -> Array:
 
 
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of unstable multipliers of the closed loop; `delay`: one way [s]."""
+    """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period)[..., None]
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(loop.angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open) > 1 + _UNIT_TOLERANCE).sum(axis=-1)
+    outside = (np.abs(loop.open) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
     return outside - (loop.signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
-    """Return the shortest round-trip delay (...) [s] at which the loop is unstable; inf: none."""
+    """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
     inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
@@ -116,7 +116,7 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the closed loop's multiplier of largest magnitude, with imaginary part >= 0."""
+    """Return the closed loop's eigenvalue of largest magnitude, with imaginary part >= 0."""
     shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
     n = loop.open.shape[-1]
     opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))
@@ -179,13 +179,13 @@ def _find_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop_gain(zeros, poles, 0.0, 1.0 + _UNIT_TOLERANCE)
+        value = _loop_gain(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _add_extremes(_add_pole_angles(angles, poles), poles, zeros, level)
+        at, values = _add_gain_extremes(_add_pole_angles(angles, poles), poles, zeros, level)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
@@ -212,10 +212,10 @@ def _find_crossings(opened, closed, levels, angles, found):
 
 @njit(cache=True)
 def _add_pole_angles(angles, poles):
-    more = np.empty(_PEAK_OFFSETS.shape[0] * poles.shape[0])
+    more = np.empty(_POLE_ANGLE_OFFSETS.shape[0] * poles.shape[0])
     count = 0
     for pole in poles:
-        for share in _PEAK_OFFSETS:
+        for share in _POLE_ANGLE_OFFSETS:
             angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
             if angles[0] < angle < math.pi:
                 more[count] = angle
@@ -224,7 +224,7 @@ def _add_pole_angles(angles, poles):
 
 
 @njit(cache=True)
-def _add_extremes(angles, poles, zeros, level):
+def _add_gain_extremes(angles, poles, zeros, level):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _loop_gain(zeros, poles, angles[i], 1.0)

@@ -20,7 +20,7 @@ from drake_teleop.lab.analysis.cut_loop import (
 )
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
-from drake_teleop.lab.analysis.maps import RATE, StabilityMap, stability_map
+from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import TaskDirection
@@ -38,13 +38,13 @@ from drake_teleop.station.scenario import Scenario, replace
 
 Array = NDArray[np.float64]
 #: N/m, walls of the table of margins, in addition to the scenario's own.
-WALLS = (0.0, 1000.0, 5100.0, 20000.0)
-COMPARISON_BAND = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
+WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
+COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
-S: Complex = 1j * OMEGA.astype(complex)
-_FIT_BAND = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
-_MAP_POINTS = 80  # points of a map in each direction
-_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
+S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
+_FIT_BAND_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
+_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
+_MEASUREMENT_MOTION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
@@ -83,8 +83,8 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest relative deviation of the Diagram's H up to 30 Hz from one-axis models."""
-    compared = OMEGA <= COMPARISON_BAND
+    """Return the Diagram's largest relative deviations from one-axis hybrid matrices to 30 Hz."""
+    compared = OMEGA <= COMPARISON_BAND_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def greatest_deviations(other: Complex) -> dict[str, float]:
@@ -92,17 +92,17 @@ def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     return {
-        "closed_form": greatest_deviations(hybrid_matrix(with_hand_mass, S[compared])),
+        "closed_form": greatest_deviations(hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])),
         "sampled": greatest_deviations(sampled_two_port(with_hand_mass, sampling, OMEGA[compared])),
     }
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Return the sampled loop's margins for each grip and wall; `own_wall` in N/m."""
+    """Return stability margins for each grip and wall; `own_wall`: another stiffness [N/m]."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIP_IMPEDANCES:
-        for wall in sorted({*WALLS, own_wall}):
+        for wall in sorted({*WALL_STIFFNESSES_N_M, own_wall}):
             held = dataclasses.replace(axis_with_grip(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
             stable = bool(count_unstable_multipliers(loop, axis.delay) == 0)
@@ -123,7 +123,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria for any passive hand and environment."""
+    """Return stability criteria for any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = scale_slave_power(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -158,13 +158,13 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedances, and tracking figures."""
-    fitted = OMEGA <= _FIT_BAND
+    """Return displayed and ideal impedances, and the tracking bandwidth; `wall`: [N/m], [N s/m]."""
+    fitted = OMEGA <= _FIT_BAND_RAD_S
     figures: dict[str, Any] = {}
-    environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
+    environments = {"free": np.zeros_like(S_AT_OMEGA), "wall": wall[1] + wall[0] / S_AT_OMEGA}
     for name, environment in environments.items():
         felt = transmitted_impedance(H, environment)
-        ideal = transparency.ideal_impedance(axis, S, environment)
+        ideal = transparency.ideal_impedance(axis, S_AT_OMEGA, environment)
         noticed = transparency.is_difference_noticed(felt, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
@@ -223,7 +223,7 @@ def measured_figures(
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0
-    found = measure_frequency_response(smooth, along, _MULTI_SINE, load_estimate=estimate)
+    found = measure_frequency_response(smooth, along, _MEASUREMENT_MOTION, load_estimate=estimate)
     # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
@@ -244,7 +244,7 @@ def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: StartStage
 ) -> dict[str, dict[str, StabilityMap]]:
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
-    n, tool = _MAP_POINTS, axis.tool_mass
+    n, tool = _POINTS_PER_MAP_AXIS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
     walls = np.geomspace(100.0, 1e5, n)
     # The sensor's low-pass has to stay below half of its rate.
@@ -257,7 +257,7 @@ def parameter_maps(
         "Error of the estimated mass and σ, in free motion": (
             *(axis, "mass_error", np.linspace(-0.9, 4.0, n) * tool, "sigma", sigma),
         ),
-        "Rate and stiffness of the wall": (touching, RATE, rate, "wall_stiffness", walls),
+        "Rate and stiffness of the wall": (touching, RATE_NAME, rate, "wall_stiffness", walls),
     }
     progress, found = stage("Maps"), {}
     for done, (title, (base, *grid)) in enumerate(parameters.items()):

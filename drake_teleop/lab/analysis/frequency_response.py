@@ -21,8 +21,8 @@ from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
-_APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
+_NUM_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
+_MASS_FIT_BAND_RAD_S = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class MultiSine:
     settle: float = 1.5  #: s, for fading in and transients
     seed: int = 0  #: seed of the random phases
 
-    def multiples(self) -> NDArray[np.int64]:
+    def odd_multiples(self) -> NDArray[np.int64]:
         """Return the frequencies of the motion as odd multiples (n,) of 1 / period."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
@@ -46,7 +46,7 @@ class MultiSine:
 
     def sines_along(self, direction: Array, start: float) -> list[Sine]:
         """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
-        frequencies = self.multiples() / self.period
+        frequencies = self.odd_multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
         return [
@@ -65,8 +65,8 @@ class MultiSine:
         ]
 
     def _phases(self) -> Array:
-        k = self.multiples()
-        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_PHASE_DRAWS, len(k)))
+        k = self.odd_multiples()
+        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
         angle = 2 * np.pi * np.outer(u, k)
         peaks = [np.abs(np.cos(angle + draw).sum(axis=1)).max() for draw in draws]
@@ -90,7 +90,7 @@ class StationResponse:
         return ratio
 
     def coherence(self, output: str, input_: str) -> Array:
-        """Return (n,): fraction of the output's power that is linear in the input."""
+        """Return the fraction (n,) of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
@@ -98,10 +98,10 @@ class StationResponse:
 
     def apparent_mass(self) -> float:
         """Return the displayed tool mass at the slave's scale [kg], for delays far below 0.1 s."""
-        low = self.omega <= _APPARENT_MASS_BAND
+        low = self.omega <= _MASS_FIT_BAND_RAD_S
         if np.count_nonzero(low) < 3:
             raise DrakeTeleopError(
-                "fewer than three frequencies are below 10 Hz",
+                f"{np.count_nonzero(low)} frequencies are below 10 Hz (the fit of a mass needs 3)",
                 where="MultiSine",
                 remedy="lower `lowest` or lengthen `period`",
             )
@@ -132,9 +132,9 @@ def measure_frequency_response(
     steps = round(excitation.period * rate)
     if abs(steps - excitation.period * rate) > 1e-6:
         raise DrakeTeleopError(
-            f"{excitation.period:g} s are not a whole number of steps at {rate:g} Hz",
+            f"{excitation.period:g} s are not a whole number of the hand's periods at {rate:g} Hz",
             where="MultiSine.period",
-            remedy="choose a multiple of the step",
+            remedy=f"choose a multiple of {1 / rate:g} s",
         )
     start = max((move.t_start + move.duration for move in approach), default=0.0)
     intent: list[MinimumJerk | Sine] = [*approach, *excitation.sines_along(task.hand, start)]
@@ -147,14 +147,14 @@ def measure_frequency_response(
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
     result = simulate(diagram, drawing.simulation, progress=False)
-    multiples = excitation.multiples()
+    odd_multiples = excitation.odd_multiples()
     spectra: dict[str, Complex] = {
-        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, multiples]
+        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, odd_multiples]
         * (2 / steps)
         for name, signal in _signals_along_task(result, scenario, task).items()
     }
     return StationResponse(
-        np.asarray(2 * np.pi / excitation.period * multiples, dtype=float),
+        np.asarray(2 * np.pi / excitation.period * odd_multiples, dtype=float),
         spectra,
         scenario.force_scaling.force_scale,
     )

@@ -50,14 +50,14 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-AXES = ("x", "y", "z", "rx", "ry", "rz")
-_INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
-_OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
+COMPONENT_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+_INPUT_PORTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
+_OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
 # Displacements for differences: errors grow with their square, and with rounding over them.
 _ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
-_MAX_ACCELERATION = 20.0  # rad/s^2, requested of a joint: within the motors' torque
+_MAX_ACCELERATION_RAD_S2 = 20.0  # rad/s^2, requested of a joint: within the motors' torque
 _CONTACT_STEP = 1e-6  # rad, m: much less than the indentation by 1 N
 _REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
 _MAX_NEWTON_STEPS = 8  # of Newton's method
@@ -70,7 +70,7 @@ _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Linear model of one period, x[k+1] = A x + B u, y = C x + D u, and delayed feedback loops.
+    """Linear model x[k+1] = A x + B u, y = C x + D u of one period, and delayed feedback loops.
 
     Components of a port are "port.x", ..., "port.rz": poses as translation [m] and rotation vector
     [rad], wrenches [N, N m], twists [m/s, rad/s].
@@ -92,8 +92,8 @@ class Linearization:
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
         rows, columns = (
-            self._indices_of(outputs, self.outputs),
-            self._indices_of(inputs, self.inputs),
+            self._find_indices(outputs, self.outputs),
+            self._find_indices(inputs, self.inputs),
         )
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
@@ -125,17 +125,17 @@ class Linearization:
             values = np.linalg.eigvals(self.with_delays_as_states().A)
         elif size > MAX_STATES:
             raise DrakeTeleopError(
-                f"{size} states are too many for eigenvalues; most of them represent the delay",
+                f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
                 where="channel.delay",
-                remedy="count unstable multipliers of one axis instead (cut_loop)",
+                remedy="shorten the delay, or count unstable multipliers of one axis (cut_loop)",
             )
         else:
             values = _find_eigenvalues_near_circle(
-                self._sparse_transition(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
+                self._sparse_state_matrix(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
             )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
-    def _sparse_transition(self, size: int) -> Any:
+    def _sparse_state_matrix(self, size: int) -> Any:
         from scipy.sparse import lil_array
 
         n = end = len(self.A)
@@ -171,13 +171,13 @@ class Linearization:
         )
 
     @staticmethod
-    def _indices_of(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
-        parts = _port_parts(names) if isinstance(names, str) else names
+    def _find_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+        parts = _axis_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
                 f"'{missing[0]}' is no port or component of this model",
-                where="close",
+                where="close_loop",
                 remedy=f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']",
             )
         return tuple(known.index(name) for name in parts)
@@ -227,14 +227,14 @@ def linearize(
     """Return the scenario's Diagram, linearised at rest with its loops cut.
 
     Intended motion, network and passivity method have no effect. `displacement` of the master [m]
-    is in B.
+    is in its base frame B.
     """
     check_scenario(scenario)
     if load_estimate is not None:
         load_estimate = finite_array("load_estimate", load_estimate, 16)
         # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
-    period = _Period(scenario, load_estimate)
+    period = _PeriodSimulator(scenario, load_estimate)
     x, A, C = period.find_rest_state(np.asarray(displacement, dtype=float))
     B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
@@ -242,12 +242,12 @@ def linearize(
     D = np.zeros((len(C), B.shape[1]))
     A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
     return Linearization(
-        A, B, C, D, period.dt, names, _port_parts(*_INPUTS), _port_parts(*_OUTPUTS)
+        A, B, C, D, period.dt, names, _axis_names(*_INPUT_PORTS), _axis_names(*_OUTPUT_PORTS)
     )
 
 
-def _port_parts(*ports: str) -> tuple[str, ...]:
-    return tuple(f"{port}.{axis}" for port in ports for axis in AXES)
+def _axis_names(*ports: str) -> tuple[str, ...]:
+    return tuple(f"{port}.{axis}" for port in ports for axis in COMPONENT_NAMES)
 
 
 def linearize_station(
@@ -260,9 +260,9 @@ def linearize_station(
     check_scenario(scenario)
     if scenario.passivity.method != "none":
         raise DrakeTeleopError(
-            f"'{scenario.passivity.method}' is not linear",
+            f"'{scenario.passivity.method}' cannot be linearised",
             where="passivity.method",
-            remedy="linearise with method: none, or identify the frequency response",
+            remedy="set method: none, or use measure_frequency_response",
         )
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
     return close_network(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
@@ -288,7 +288,8 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
     """Return the hybrid matrix H (n, 2, 2) along one direction at omega (n,) [rad/s], not zero.
 
-    In `system` the hand's loop is cut in this direction. H includes the hand's mass.
+    In `system` the hand's loop is cut in this direction. H includes the hand's mass. `hand` and
+    `tool` are those of `TaskDirection`.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -317,20 +318,20 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class _States:
+class _StateGroup:
     system: str
     group: int | None
     part: slice | NDArray[np.intp]
     steps: Array  # displacements for the differences
 
 
-class _Period:
+class _PeriodSimulator:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
         own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
-                f"the device's own rate of {1 / own_period:g} Hz is below the hand's rate",
+                f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)",
                 where="rates.hand_hz",
                 remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
             )
@@ -348,7 +349,7 @@ class _Period:
         self._has_ik_state = ik_method_name(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
-        self._sensor = self._system("wrist_sensor")
+        self._sensor = self._get_block("wrist_sensor")
         servo = smooth.joint_control
         servo.check_computed_torque("the linearisation")
         scenario.master.check_pose_mode("the linearisation")
@@ -356,14 +357,14 @@ class _Period:
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
-        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION / gain)
+        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_RAD_S2 / gain)
         has_contact = smooth.surroundings is not None
         self._joint_step = (
             min(self._command_step, _CONTACT_STEP) if has_contact else self._command_step
         )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
-        self._groups = self._state_groups()
+        self._groups = self._make_state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
         # The sensor's memory follows from the other states; it is of order 1.
         sensed = [group.system == "wrist_sensor" for group in self._groups]
@@ -380,24 +381,24 @@ class _Period:
         self._apply_inputs(np.zeros(24))
         self._simulator.Initialize()
 
-    def _system(self, name: str) -> Any:
+    def _get_block(self, name: str) -> Any:
         return GetBlock(self._diagram, name)
 
-    def _context(self, name: str) -> Any:
+    def _get_context(self, name: str) -> Any:
         root = self._simulator.get_mutable_context()
-        return self._system(name).GetMyMutableContextFromRoot(root)
+        return self._get_block(name).GetMyMutableContextFromRoot(root)
 
     def _evaluate_output(self, system: str, port: str) -> Array:
-        return np.array(self._system(system).GetOutputPort(port).Eval(self._context(system)))
+        return np.array(self._get_block(system).GetOutputPort(port).Eval(self._get_context(system)))
 
     def _fix_input(self, system: str, port: str, value: object) -> None:
-        self._system(system).GetInputPort(port).FixValue(self._context(system), value)
+        self._get_block(system).GetInputPort(port).FixValue(self._get_context(system), value)
 
-    def _state_groups(self) -> list[_States]:
-        def whole_group(system: str, group: int, *steps: Array) -> _States:
-            return _States(system, group, slice(None), np.concatenate(steps))
+    def _make_state_groups(self) -> list[_StateGroup]:
+        def whole_group(system: str, group: int, *steps: Array) -> _StateGroup:
+            return _StateGroup(system, group, slice(None), np.concatenate(steps))
 
-        joints = self._context("slave_plant").num_continuous_states() // 2
+        joints = self._get_context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
         remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
@@ -406,24 +407,24 @@ class _Period:
             whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
             whole_group("master_device", 2, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
-            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
+            _StateGroup("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
             whole_group("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
-            _States(
+            _StateGroup(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _States("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
-            *self._ik_state(),
+            _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
+            *self._ik_state_groups(),
         ]
 
-    def _ik_state(self) -> list[_States]:
+    def _ik_state_groups(self) -> list[_StateGroup]:
         steps = np.full(self._joints, self._command_step)
-        command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
+        command = _StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps)
         return [command] if self._has_ik_state else []
 
     def get_state(self) -> Array:
         parts = []
         for group in self._groups:
-            context = self._context(group.system)
+            context = self._get_context(group.system)
             if group.group is None:
                 parts.append(context.get_continuous_state_vector().CopyToVector())
             else:
@@ -433,13 +434,13 @@ class _Period:
     def _set_state(self, x: Array) -> None:
         ends = np.cumsum([len(group.steps) for group in self._groups])
         for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
-            context = self._context(group.system)
+            context = self._get_context(group.system)
             if group.group is None:
                 context.SetContinuousState(values)
             else:
                 state = context.get_mutable_discrete_state(group.group)
                 state.get_mutable_value()[group.part] = values
-        self._sensor.reset_queue(self._context("wrist_sensor"))
+        self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
     def _apply_inputs(self, u: Array) -> None:
         self._fix_input("master_device", "hand_wrench_E", self._hand + u[:6])
@@ -450,7 +451,7 @@ class _Period:
         self._fix_input("slave_plant", "applied_spatial_force", [self._push])
         self._fix_input("wrist_sensor", "applied_wrench_W", push)
 
-    def _slave_state(self) -> Array:
+    def _read_slave_state(self) -> Array:
         return self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
 
     def _run_one_period(self) -> Array:
@@ -458,18 +459,18 @@ class _Period:
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
         if self._has_ik_state:  # time of its last command
-            command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
+            command = self._get_context("inverse_kinematics").get_mutable_discrete_state(0)
             command.get_mutable_value()[-1] = 0.0
-        self._sensor.reset_queue(self._context("wrist_sensor"))
+        self._sensor.reset_queue(self._get_context("wrist_sensor"))
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         self._simulator.AdvanceTo(2 * self.dt)
-        self._sensor.take_samples(self._context("wrist_sensor"))
+        self._sensor.take_samples(self._get_context("wrist_sensor"))
         return self.get_state()
 
     def _evaluate_outputs(self) -> Array:
         pose, state = (
             self._evaluate_output("kinematic_scaling", "pose_command"),
-            self._slave_state(),
+            self._read_slave_state(),
         )
         J = np.empty((6, self._joints))
         jacobian(self._arm, state[: self._joints], J)
@@ -488,7 +489,7 @@ class _Period:
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
         q = self._device.inverse_kinematics(pose_B)
-        context = self._context("master_device")
+        context = self._get_context("master_device")
         rest = (
             np.append(q, np.zeros(len(q))),
             pose_B,
@@ -505,9 +506,9 @@ class _Period:
             self._pose = start + share * (target - start)
             self._apply_inputs(np.zeros(24))
             self._run_one_period()
-        return self._find_equilibrium(self._balance_hand())
+        return self._find_equilibrium(self._balance_hand_force())
 
-    def _balance_hand(self) -> Array:
+    def _balance_hand_force(self) -> Array:
         self._wrench = self._evaluate_output("force_scaling", "wrench_B")
         self._apply_inputs(np.zeros(24))
         self._hand = -self._evaluate_output("force_display", "force_to_master")
@@ -526,9 +527,9 @@ class _Period:
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
             self._set_state(x)
-            x = self._balance_hand()
+            x = self._balance_hand_force()
         raise DrakeTeleopError(
-            f"the slave does not come to rest (state {self.states[np.argmax(np.abs(moved))]})",
+            f"the slave does not come to rest: {self.states[np.argmax(np.abs(moved))]} changes",
             where="displacement",
             remedy="choose another operating point",
         )
@@ -623,7 +624,7 @@ def _check_rates(scenario: Scenario) -> None:
     rates = scenario.rates
     if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
         raise DrakeTeleopError(
-            "the gains of the loops require equal rates of hand and joint control",
+            "hand and joint control, or sensor and hand, have unequal rates (they set loop gains)",
             where="rates",
             remedy="set joint_control_hz to hand_hz, and sensor_hz to a multiple of it",
         )

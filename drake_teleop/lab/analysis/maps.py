@@ -1,4 +1,4 @@
-"""Stability and distortion of the sampled loop over two parameters."""
+"""Maps of stability and force distortion of the sampled loop over two parameters."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from drake_teleop.lab.analysis.transparency import ideal_impedance
 Array = NDArray[np.float64]
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
-RATE = "rate"
-_PARAMETERS = {entry.name for entry in fields(OneAxis)} - {"ideal_servo"} | {RATE, "low_pass_hz"}
-_HALVINGS = 10
-_DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
+RATE_NAME = "rate"
+_PARAMETERS = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
+_NUM_BISECTION_STEPS = 10
+_DISTORTION_BAND_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # of deliberate movements
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def stability_map(
 ) -> StabilityMap:
     """Return stability and distortion over increasing values of two parameters.
 
-    Names are fields of `OneAxis`, "low_pass_hz", or "rate": all rates in proportion.
+    Parameters: fields of `OneAxis`, "low_pass_hz", or "rate" (all rates in proportion).
     """
     xs, ys = _check_increasing(x_name, x), _check_increasing(y_name, y)
 
@@ -93,7 +93,7 @@ def stability_map(
 
 
 def force_distortion(
-    axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND
+    axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND_RAD_S
 ) -> Array:
     """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
@@ -128,7 +128,7 @@ def _loops_with_values(
     axis: OneAxis, sampling: Sampling, values: dict[str, Any]
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():
-        if name == RATE:
+        if name == RATE_NAME:
             factor = value / sampling.hand_hz
             sampling = replace(
                 sampling,
@@ -147,7 +147,7 @@ def _bisect_stability_limit(
     is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]
 ) -> Array:
     low, high = low.copy(), high.copy()
-    for _ in range(_HALVINGS if low.size else 0):
+    for _ in range(_NUM_BISECTION_STEPS if low.size else 0):
         middle = 0.5 * (low + high)
         as_low = is_stable(middle) == stable_at_low
         low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)

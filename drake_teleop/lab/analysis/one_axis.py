@@ -52,7 +52,7 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(Axis):
-    """Parameters of one direction: numbers, or arrays that broadcast."""
+    """`Axis` with damping of device and wall, mass error, motion scale, delay; arrays broadcast."""
 
     device_damping: float = 0.5  #: N s/m
     mass_error: float = 0.0  #: kg, estimated minus true tool mass
@@ -79,7 +79,7 @@ def environment_impedance(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_response(axis: OneAxis, s: Complex) -> Complex:
-    """Return C / (Z_s + C): slave position over command."""
+    """Return slave position over command, C / (Z_s + C)."""
     if axis.ideal_servo:
         return np.ones_like(s)
     gain = axis.velocity_gain * axis.position_gain
@@ -87,7 +87,7 @@ def servo_response(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_admittance(axis: OneAxis, s: Complex) -> Complex:
-    """Return 1 / (Z_s + C) [m/(N s)]: slave velocity over contact force."""
+    """Return slave velocity over contact force, 1 / (Z_s + C) [m/(N s)]."""
     if axis.ideal_servo:
         return np.zeros_like(s)
     kv, kp = axis.velocity_gain, axis.position_gain

@@ -24,12 +24,12 @@ Array = NDArray[np.float64]
 X_M, V_M, SERVO, X_S, V_S, SAMPLE, FILTER = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HAND, _ENVIRONMENT, RECEIVED = -3, -2, -1
-_MAX_EVENTS = 1000
+_MAX_RATE_RATIO = 1000
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rates of the station; default: the shipped scenarios with the ideal sensor."""
+    """Sample rates of the station; defaults: the shipped scenarios with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
@@ -52,15 +52,15 @@ def cut_period_map(axis: OneAxis, sampling: Sampling) -> Array:
         raise DrakeTeleopError(
             "the sampled model does not include an ideal servo",
             where="axis.ideal_servo",
-            remedy="set it to False with high gains, or use two_port.hybrid",
+            remedy="set it to False with high gains, or use two_port.hybrid_matrix",
         )
     servo_samples, sensor_samples = (
-        _periods_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
+        _samples_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
     n = FILTER + 2 * sections.shape[-2]
-    rows = _Rows(axis, n + 3)
+    rows = _MatrixRows(axis, n + 3)
     hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
@@ -114,15 +114,15 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     return np.moveaxis(H, 2, 0)
 
 
-def _periods_per_hand_period(sampling: Sampling, name: str) -> int:
+def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (1 <= count <= _MAX_EVENTS and (np.abs(ratios - count) <= 1e-9 * count).all()):
+    if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
         raise DrakeTeleopError(
-            f"{name} is no whole multiple of hand_hz",
+            "is no whole multiple of hand_hz",
             where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_EVENTS} times as fast as the hand",
+            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as fast as the hand",
         )
     return count
 
@@ -142,11 +142,11 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     return sections.reshape(*rates.shape, 2, 5)
 
 
-class _Rows:
+class _MatrixRows:
     def __init__(self, axis: OneAxis, size: int) -> None:
         self._axis, self._size = axis, size
 
-    def _row(self, entries: dict[int, Any]) -> Array:
+    def _make_row(self, entries: dict[int, Any]) -> Array:
         values = np.broadcast_arrays(
             *(np.asarray(value, dtype=float) for value in entries.values())
         )
@@ -167,33 +167,33 @@ class _Rows:
             V_M: -axis.hand_damping / mass,
             _HAND: 1 / mass,
         }
-        force = self._row(hand_force) + self._row({RECEIVED: -1 / mass})
+        force = self._make_row(hand_force) + self._make_row({RECEIVED: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
-            ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
+            ahead[i] = ahead[i] + self._make_row({X_M: x[..., i], V_M: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
     def servo_rows(self) -> Array:
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
-        row = self._row({X_M: kv * kp * self._axis.position_scale})
-        return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
+        row = self._make_row({X_M: kv * kp * self._axis.position_scale})
+        return (row + self._make_row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor_rows(self, sections: Array) -> Array:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
-        value = self._row(
+        value = self._make_row(
             {
                 index: axis.force_scale * environment * share
                 for index, share in self._environment_entries().items()
             }
-        ) + self._row({SERVO: axis.force_scale * felt_mass})
+        ) + self._make_row({SERVO: axis.force_scale * felt_mass})
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
             first, second = FILTER + 2 * k, FILTER + 2 * k + 1
-            filtered = b0 * value + self._row({first: 1.0})
-            memory.append(b1 * value - a1 * filtered + self._row({second: 1.0}))
+            filtered = b0 * value + self._make_row({first: 1.0})
+            memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
             memory.append(b2 * value - a2 * filtered)
             value = filtered
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
@@ -206,13 +206,13 @@ class _Rows:
         for i in range(2):
             p = push[..., i]
             rows.append(
-                self._row({X_S: x[..., i], V_S: v[..., i], SERVO: p, _ENVIRONMENT: -p / mass})
+                self._make_row({X_S: x[..., i], V_S: v[..., i], SERVO: p, _ENVIRONMENT: -p / mass})
             )
         return np.stack(rows, axis=-2)
 
 
 def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    """Return the (..., 2) responses of x'' = u - b x' - k x to unit x, unit x' and held unit u."""
+    # (x, x') after `time` of x'' = u - b x' - k x, from x = 1, from x' = 1, and for u = 1.
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
@@ -233,7 +233,7 @@ def _matrix_exponential(M: Array) -> Array:
 
 
 def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
-    """Return C (z - A)^-1 B (N, p, m) at z (N,)."""
+    # C (z I - A)^-1 B, (N, p, m).
     balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
     T, Q = schur(balanced, output="complex")
     right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q

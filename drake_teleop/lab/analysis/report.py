@@ -37,7 +37,7 @@ from drake_teleop.lab.analysis.two_port import (
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> label of its axis, and the factor to its unit.
-_AXES = {
+_AXIS_LABELS = {
     "delay": ("round trip [ms]", 2e3),
     "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3),
     "sigma": ("σ", 1.0),
@@ -64,7 +64,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
         "bode": draw_bode(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
         "passive": draw_passive_loads(curves),
-        "widths": draw_widths(curves, summary["z_width"]),
+        "widths": draw_z_widths(curves, summary["z_width"]),
         "maps": draw_maps(curves, summary["grip"]),
     }
     for name, figure in pictures.items():
@@ -177,7 +177,7 @@ def draw_nyquist(curves: Curves) -> Figure:
 
 
 def draw_passive_loads(curves: Curves) -> Figure:
-    """Draw Llewellyn's parameter, the scattering norm, and mu."""
+    """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
     scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
@@ -209,7 +209,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
     return figure
 
 
-def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
+def draw_z_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_z_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
@@ -261,7 +261,7 @@ def draw_maps(curves: Curves, grip: str) -> Figure:
 
 def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
     one = shown[grip]
-    (x_label, x_factor), (y_label, y_factor) = _AXES[one.x_name], _AXES[one.y_name]
+    (x_label, x_factor), (y_label, y_factor) = _AXIS_LABELS[one.x_name], _AXIS_LABELS[one.y_name]
     x, y = x_factor * one.x, y_factor * one.y
     distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
     axes.set_facecolor("#D5D8DD")

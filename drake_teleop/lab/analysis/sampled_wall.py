@@ -16,13 +16,13 @@ from drake_teleop.lab.analysis.one_axis import Complex
 
 Array = NDArray[np.float64]
 
-_HALVINGS = 60
+_NUM_BISECTION_STEPS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
-    """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62)."""
-    b = _positive_array(device_damping, "damping of the device")
-    _positive_array(period, "period")
+    """Return the largest stiffness [N/m] of a passive virtual wall; 0: none is passive (T62)."""
+    b = _check_positive(device_damping, "damping of the device")
+    _check_positive(period, "period")
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
 
 
@@ -34,7 +34,7 @@ def stable_stiffness(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Array:
-    """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: unstable with any.
+    """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: always unstable.
 
     Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
@@ -42,7 +42,7 @@ def stable_stiffness(
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / held[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
-    for _ in range(_HALVINGS):
+    for _ in range(_NUM_BISECTION_STEPS):
         middle = (low + high) / 2
         poles = sampled_poles(
             mass, damping, middle, wall_damping, period, hand_stiffness=hand_stiffness
@@ -80,9 +80,9 @@ def _sampled_device(
 ) -> tuple[Array, Array]:
     from scipy.linalg import expm
 
-    _positive_array(mass, "mass of the device")
-    _positive_array(damping, "damping of the device")
-    _positive_array(period, "period")
+    _check_positive(mass, "mass of the device")
+    _check_positive(damping, "damping of the device")
+    _check_positive(period, "period")
     m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
         raise DrakeTeleopError(
@@ -97,7 +97,7 @@ def _sampled_device(
     return motion[..., :2, :2], motion[..., :2, 2]
 
 
-def _positive_array(value: ArrayLike, what: str) -> Array:
+def _check_positive(value: ArrayLike, what: str) -> Array:
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive", remedy="give values above 0")

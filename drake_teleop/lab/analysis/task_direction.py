@@ -56,8 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    `displacement` of the master [m] is in B. Without `load_estimate` (16,) the tool mass has no
-    error.
+    `displacement` of the master [m] is in its base frame B. Without `load_estimate` (16,) the
+    tool mass has no error.
     """
     check_scenario(scenario)
     n_W = finite_array("direction", direction, 3)
@@ -68,7 +68,7 @@ def task_direction(
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
         raise DrakeTeleopError(
-            "gripper and object have different scales; one axis needs one sigma",
+            "sets different sigmas for gripper and object (one axis has one sigma)",
             where="force_scaling.eta",
             remedy="set eta: null",
         )

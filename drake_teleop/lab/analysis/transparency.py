@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, device_impedance
 from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
 
-Real = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
@@ -31,7 +31,7 @@ class ApparentImpedance(NamedTuple):
     stiffness: NDArray[np.float64]  #: N/m
 
 
-def fit_apparent_impedance(felt: Complex, omega: Real) -> ApparentImpedance:
+def fit_apparent_impedance(felt: Complex, omega: RealArray) -> ApparentImpedance:
     """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = felt.imag.reshape(len(omega), -1)
@@ -49,7 +49,7 @@ class ZWidth(NamedTuple):
     rigid: Complex
 
     @property
-    def decades(self) -> Real:
+    def decades(self) -> RealArray:
         """Dynamic range log10(|rigid| / |free|)."""
         return np.log10(np.abs(self.rigid) / np.abs(self.free))
 
@@ -68,18 +68,18 @@ WEBER_FRACTION = 0.23
 
 
 def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return where a human distinguishes the displayed impedance from the ideal."""
+    """Return, for each frequency, whether a human notices the difference of the impedances."""
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
 def smallest_stiffness_change(
     H: Complex,
-    omega: Real,
+    omega: RealArray,
     stiffness: ArrayLike,
     weber: float = WEBER_FRACTION,
     damping: ArrayLike = 0.0,
-) -> Real:
-    """Return the smallest detectable increase of the environment's stiffness [N/m], or inf."""
+) -> RealArray:
+    """Return the smallest stiffness increase [N/m] that a human detects, or inf."""
     if weber <= 0:
         raise DrakeTeleopError(
             f"the Weber fraction is {weber:g}, must be positive",

@@ -78,7 +78,7 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
-            "reference impedances need scales above 0",
+            "one of them is 0 (reference impedances need both above 0)",
             where="force_scale, translation_scale",
             remedy="set both above 0",
         )
@@ -86,7 +86,7 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
 
 
 def power_ratio(axis: OneAxis) -> float:
-    """Return the ratio k_f gamma / l_p of power at the hand to power at the slave."""
+    """Return hand power over slave power: force scale times gamma over motion scale."""
     return axis.force_scale * axis.gamma / axis.position_scale
 
 

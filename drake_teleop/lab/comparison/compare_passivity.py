@@ -52,18 +52,18 @@ from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
 #: Round trips of the study in one degree of freedom [s].
-ROUND_TRIPS = (
+ROUND_TRIPS_S = (
     *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
 )
-WALLS = (500.0, 5100.0, 20000.0)  #: N/m
-IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
+WALL_STIFFNESSES_N_M = (500.0, 5100.0, 20000.0)  #: N/m
+NETWORK_IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
 _COVERING_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
-_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_RUN_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
-_MAX_STEP = 2e-3
+_MAX_STEP_S = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
 _SLIP_SPEED_M_S = 1e-3
@@ -80,7 +80,7 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compare all or these methods; write summary, runs, report and pictures into `out`.
+    """Compare the given methods, or all; write summary, runs, report and pictures into `out`.
 
     Rates, integrator and environment of the scenario are not used. Return the content of
     summary.json (docs/delay.md).
@@ -95,10 +95,10 @@ def compare_command(
         METHODS.check(name, "methods")
     make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
-        limits = _one_dof_study(methods, seed, jobs, stage)
-        released = _hands_study(networks, methods, seed, jobs, stage)
-        runs, traces = _station_study(scenario, networks, methods, seed, jobs, stage)
-        covering = _covering_study(stage)
+        limits = _run_one_dof_study(methods, seed, jobs, stage)
+        released = _run_release_study(networks, methods, seed, jobs, stage)
+        runs, traces = _run_station_study(scenario, networks, methods, seed, jobs, stage)
+        covering = _run_covering_study(stage)
     summary = {
         "networks": list(networks),
         "methods": list(methods),
@@ -136,9 +136,9 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none."""
+    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none."""
     longest = 0.0
-    for round_trip in ROUND_TRIPS:
+    for round_trip in ROUND_TRIPS_S:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
         for seed in seeds if jitter or loss else seeds[:1]:
             run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
@@ -148,20 +148,20 @@ def longest_round_trip(
     return longest
 
 
-def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the comparison's rates."""
+def base_scenario(scenario: str | Path, seed: int) -> Scenario:
+    """Return the scenario without environment, with the rates of the comparison."""
     return replace(
         LoadScenario(scenario).without_environment(),
-        simulation=Simulation(seed=seed, max_step=_MAX_STEP),
-        rates=_RATES,
+        simulation=Simulation(seed=seed, max_step=_MAX_STEP_S),
+        rates=_RUN_RATES,
         contact_detection=None,
     )
 
 
-def station_run(
+def simulate_press(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Press on a leaf spring; return the table row and the traces."""
+    """Simulate a press on a leaf spring; return its table row and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
@@ -184,7 +184,7 @@ def station_run(
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
-    return row | _finite_or_none(dataclasses.asdict(found) | additional) | {"error": None}, shown
+    return row | _replace_nonfinite(dataclasses.asdict(found) | additional) | {"error": None}, shown
 
 
 def _run_to_end_or_hold(
@@ -206,10 +206,10 @@ def _run_to_end_or_hold(
     return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
 
 
-def _one_dof_study(
+def _run_one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
-    cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
+    cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, NETWORK_IMPAIRMENTS))
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
@@ -228,13 +228,13 @@ def _one_dof_study(
             "jitter": jitter,
             "loss": loss,
             "longest_s": longest,
-            "grid_s": list(ROUND_TRIPS),
+            "grid_s": list(ROUND_TRIPS_S),
         }
         for (method, wall, (jitter, loss)), longest in zip(cases, found, strict=True)
     ]
 
 
-def _hands_study(
+def _run_release_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
@@ -252,7 +252,7 @@ def _hands_study(
     ]
 
 
-def _station_study(
+def _run_station_study(
     scenario: str | Path,
     networks: Sequence[str],
     methods: Sequence[str],
@@ -260,13 +260,13 @@ def _station_study(
     jobs: int,
     stage: StartStage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
-    base = station_base(scenario, seed)
+    base = base_scenario(scenario, seed)
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAF_SPRINGS, methods))
     results = _run_parallel(
-        station_run,
+        simulate_press,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
         stage("The whole station"),
@@ -287,7 +287,7 @@ def _station_study(
     return rows, traces
 
 
-def _covering_study(stage: StartStage) -> list[dict[str, Any]]:
+def _run_covering_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
@@ -318,7 +318,7 @@ def _run_parallel(
     return results
 
 
-def _finite_or_none(figures: dict[str, Any]) -> dict[str, Any]:
+def _replace_nonfinite(figures: dict[str, Any]) -> dict[str, Any]:
     return {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in figures.items()

@@ -1,4 +1,4 @@
-"""Decision table: the first applicable verdict of docs/delay.md."""
+"""Decision table: for each method and network, the first applicable verdict of docs/delay.md."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class MethodResult:
 
     @property
     def displayed_share(self) -> str:
-        """Displayed over contact force at the worst leaf spring; "" if unstable."""
+        """Least displayed over scaled contact force of all leaf springs [%]; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
-    """Return the table (method, network) -> cell of a summary."""
+    """Return the result of each (method, network) in a summary."""
     return {
         (row["method"], row["network"]): _summarise_runs(
             [
@@ -59,7 +59,7 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
 
 def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
     if not all(run["stable"] for run in runs):
-        return MethodResult(VERDICT_UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
+        return MethodResult(VERDICT_UNSTABLE, unrest=tuple(map(_describe_motion_in_hold, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
@@ -71,7 +71,7 @@ def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -
     )
 
 
-def _motion_in_hold(run: Mapping[str, Any]) -> str:
+def _describe_motion_in_hold(run: Mapping[str, Any]) -> str:
     if run["stable"]:
         return "at rest"
     if run["hunting"] is None:

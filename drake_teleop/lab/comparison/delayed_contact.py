@@ -29,7 +29,7 @@ LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round trip [s]."""
+    """Return the times of the task for a round-trip delay [s]."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -102,7 +102,7 @@ def leaf_thickness(stiffness: float) -> float:
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
-    """Return the measures of a run."""
+    """Return the measures of a run of the task."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
     return figures_of_traces(
@@ -129,7 +129,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
+    """Return the method's initial energy plus that (N,) put in by hand and environment [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         accounts += load_work(result, scenario)

@@ -30,13 +30,13 @@ from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: period of the channel [s]
-_SUBSTEPS = 20
-_FRICTION_SPEED = 5e-3  # m/s, regularisation of the device's Coulomb friction
-_SLAVE_FRICTION_SPEED = 1e-3  # m/s, regularisation of the slave's friction
+_SUBSTEPS_PER_PERIOD = 20
+_FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb friction
+_SLAVE_FRICTION_SPEED_M_S = 1e-3  # m/s, regularisation of the slave's friction
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
-_FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
-_MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
+_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
+_MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
 TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
@@ -57,7 +57,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(Axis):
-    """`Axis` with Coulomb friction instead of device damping, and with imperfections.
+    """`Axis` with Coulomb friction, no device damping, and lag, encoders, noise, model errors.
 
     The equations of motion are::
 
@@ -209,7 +209,7 @@ def run_one_dof(
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.
     held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
-    rows = _simulate(
+    rows = _simulate_steps(
         methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
         ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
@@ -223,15 +223,15 @@ def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
-    fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
+    fade = np.minimum(_smooth_ramp(t, task.swing, 0.5), 1 - _smooth_ramp(t, task.swung - 0.5, 0.5))
     x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
-    pressing = _ramp(t, task.press, task.pressed - task.press)
-    releasing = _ramp(t, task.release, task.released - task.release)
+    pressing = _smooth_ramp(t, task.press, task.pressed - task.press)
+    releasing = _smooth_ramp(t, task.release, task.released - task.release)
     x += (_DEPTH - _REST_POSITION) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
-def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.float64]:
+def _smooth_ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.float64]:
     u = np.clip((t - start) / length, 0.0, 1.0)
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
@@ -282,7 +282,7 @@ def figures_of_traces(
     start = round(task.press / dt)
     return RunMeasures(
         stable=bool(
-            hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP_DISTANCE_M
+            hunting < _MAX_MOTION_AT_REST_M and turning < _MAX_MOTION_AT_REST_M / TIP_DISTANCE_M
         ),
         hunting=hunting,
         turning=turning,
@@ -302,7 +302,7 @@ def covering_damping(model: OneDof, round_trip: float) -> float:
 
 
 def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
-    s = 1j * _FREQUENCIES
+    s = 1j * _FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
@@ -331,11 +331,10 @@ def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady:
 
 
 @njit(cache=True)
-def _simulate(
+def _simulate_steps(
     steps, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
     course,
 ):  # fmt: skip
-    """Return rows [master, slave, command, felt, wall, energy (2), silence (2), accounts (4)]."""
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
     master_resolution, slave_resolution, noise, seed = model[13:]
@@ -344,10 +343,11 @@ def _simulate(
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
     felt, ports = np.zeros(7), np.zeros(NUM_PORT_SIGNALS)
+    # Columns: master, slave, command, felt, wall, energy (2), silent (2), accounts (4).
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
-    dt = PERIOD / _SUBSTEPS
+    dt = PERIOD / _SUBSTEPS_PER_PERIOD
     for k in range(course.shape[0]):
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
@@ -372,16 +372,16 @@ def _simulate(
         copy_into(rows[k], 7, ports, 4, 2)
         copy_into(rows[k], 9, accounts, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
-        for i in range(_SUBSTEPS):
-            share = (i + 0.5) / _SUBSTEPS
+        for i in range(_SUBSTEPS_PER_PERIOD):
+            share = (i + 0.5) / _SUBSTEPS_PER_PERIOD
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
             v_i = course[k, 1] + share * (course[following, 1] - course[k, 1])
             force = stiffness * (x_i - x) + damping * (v_i - v) + felt[0]
-            v += dt / mass * (force - friction * np.tanh(v / _FRICTION_SPEED))
+            v += dt / mass * (force - friction * np.tanh(v / _FRICTION_SPEED_M_S))
             x += dt * v
             x_then, v_then = x_s, v_s
             if ideal > 0.0:
-                x_s = before + (i + 1.0) / _SUBSTEPS * (command - before)
+                x_s = before + (i + 1.0) / _SUBSTEPS_PER_PERIOD * (command - before)
                 v_new = (command - before) / PERIOD
                 a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
             else:
@@ -390,12 +390,12 @@ def _simulate(
                 motor = motor + dt / lag * (servo_force - motor) if lag > dt else servo_force
                 a_s = (motor - max(push, 0.0)) / slave_mass
                 if slave_friction > 0.0:
-                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED)
+                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED_M_S)
                 v_s += dt * a_s
                 x_s += dt * v_s
-            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS * PERIOD * v_w)
+            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_PERIOD * PERIOD * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_if_same_sign(push_then, push) * (x_s - x_then)
+            work = -_mean_positive_part(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -419,7 +419,7 @@ def _wall_force(stiffness, damping, depth, speed):
 
 
 @njit(cache=True)
-def _mean_if_same_sign(a, b):
+def _mean_positive_part(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -1,4 +1,4 @@
-"""A hand that lets go while it presses, and one that taps."""
+"""Simulated hands: one lets go while it presses, the other taps."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
-TAP_RATES = (1.0, 1.5)  #: Hz
+TAP_RATES_HZ = (1.0, 1.5)  #: Hz
 _NUM_TAPS, _TAP_AMPLITUDE = 8, 0.03  # number; m, amplitude about the wall's surface
-_EVALUATED_S = 2.0  # s, evaluated after letting go
+_EVALUATED_TIME_S = 2.0  # s, evaluated after letting go
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ReleaseAndTaps:
     release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
     release_way: float  #: largest displacement of the device in these 2 s [m]
-    tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES`
+    tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES_HZ`
     leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
 
 
@@ -53,7 +53,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         )
 
     release_time = 3.0 + 3 * round_trip
-    end = release_time + _EVALUATED_S
+    end = release_time + _EVALUATED_TIME_S
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, judged=0.1)
     pressing = operator_intent(task)
     release_row = round(release_time / PERIOD)
@@ -61,7 +61,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     grip[release_row:] = 0.0
     released = simulate_hand(pressing, grip)
     after = released.master[release_row:]
-    tapping = [simulate_hand(_tap_intent(rate, round_trip)) for rate in TAP_RATES]
+    tapping = [simulate_hand(_tap_intent(rate, round_trip)) for rate in TAP_RATES_HZ]
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
         release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),
@@ -69,7 +69,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
             _displayed_share(found, scale, rate, 0.5 * round_trip)
-            for found, rate in zip(tapping, TAP_RATES, strict=True)
+            for found, rate in zip(tapping, TAP_RATES_HZ, strict=True)
         ),
         leaked=max(max(0.0, -found.least_energy_sum(ACTUAL)) for found in (released, *tapping)),
     )

@@ -22,11 +22,11 @@ from drake_teleop.lab.comparison.decision import (
     VERDICT_UNSTABLE,
     decision_table,
 )
-from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
+from drake_teleop.lab.comparison.release_and_taps import TAP_RATES_HZ
 from drake_teleop.station.channel.network import PRESETS
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
-COLUMNS = (
+RUN_COLUMNS = (
     ("hunting", "Oscillation [mm]", 1e3, 2),
     ("turning", "Rotation [deg]", 180 / np.pi, 2),
     ("felt_force", "Rendered [N]", 1.0, 2),
@@ -40,15 +40,15 @@ COLUMNS = (
 )
 
 #: Verdict -> mark, colour of the cell, colour of the text. The cells also differ in lightness.
-VERDICTS = {
+VERDICT_STYLES = {
     VERDICT_HOLDS: ("✓", "#CBE4F4", BLACK),
     VERDICT_LEAKS: ("⚠", "#FBEBB8", BLACK),
     VERDICT_CHATTERS: ("≈", "#F7D39B", BLACK),
     VERDICT_POSITION_ERROR: ("↷", "#F0B878", BLACK),
     VERDICT_UNSTABLE: ("✗", "#565C66", "white"),
 }
-_MARKERS = "os^Dv"  # marks of the networks
-_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
+_NETWORK_MARKERS = "os^Dv"  # marks of the networks
+_CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
@@ -56,10 +56,10 @@ Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
     pictures = {
         "decision": draw_decision(summary),
-        "hands": draw_hands(summary),
-        "runs": draw_runs(summary, traces),
+        "hands": draw_release_and_taps(summary),
+        "runs": draw_force_traces(summary, traces),
         "energy": draw_energy(summary, traces),
-        "limits": draw_limits(summary["one_dof"]),
+        "limits": draw_round_trip_limits(summary["one_dof"]),
     }
     for name, figure in pictures.items():
         write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
@@ -67,19 +67,19 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "drake_teleop.lab.comparison",
         "report.html.j2",
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
-        columns=[heading for _, heading, _, _ in COLUMNS],
-        station=[(row, table_cells(row)) for row in summary["station"]],
+        columns=[heading for _, heading, _, _ in RUN_COLUMNS],
+        station=[(row, run_cells(row)) for row in summary["station"]],
         covering=summary["covering"],
         pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
     )
     write_text(out / "report.html", page)
 
 
-def table_cells(row: Mapping[str, Any]) -> list[str]:
+def run_cells(row: Mapping[str, Any]) -> list[str]:
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
-        for key, _, factor, decimals in COLUMNS
+        for key, _, factor, decimals in RUN_COLUMNS
     ]
 
 
@@ -90,7 +90,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
         axes = figure.subplots()
         for (method, network), cell in table.items():
             x, y = networks.index(network), methods.index(method)
-            mark, colour, text_colour = VERDICTS[cell.verdict]
+            mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
             lines += cell.unrest
@@ -102,11 +102,11 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
                 color=text_colour,
                 size=9.5,
                 weight="bold",
-                **_CENTRED,
+                **_CENTRED_TEXT,
             )
             for place, line in enumerate(lines):
                 line_y = y - offset + 0.27 * (place + 1)
-                axes.text(x, line_y, line, color=text_colour, size=8.5, **_CENTRED)
+                axes.text(x, line_y, line, color=text_colour, size=8.5, **_CENTRED_TEXT)
         axes.set_xlim(-0.5, len(networks) - 0.5)
         axes.set_ylim(len(methods) - 0.5, -0.5)
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
@@ -121,17 +121,17 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_hands(summary: Mapping[str, Any]) -> Figure:
+def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
         (
-            f"displayed share of taps at {TAP_RATES[0]:g} Hz [%]",
+            f"displayed share of taps at {TAP_RATES_HZ[0]:g} Hz [%]",
             "linear",
             lambda row: 100 * row["tap_shares"][0],
         ),
         (
-            f"displayed share of taps at {TAP_RATES[1]:g} Hz [%]",
+            f"displayed share of taps at {TAP_RATES_HZ[1]:g} Hz [%]",
             "linear",
             lambda row: 100 * row["tap_shares"][1],
         ),
@@ -144,7 +144,7 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
                 shown = [row for row in rows if row["network"] == network]
                 # Offsets keep all marks visible.
                 y = [methods.index(row["method"]) + 0.12 * (place - 2) for row in shown]
-                marker, colour = _MARKERS[place % 5], COLOURS[place % len(COLOURS)]
+                marker, colour = _NETWORK_MARKERS[place % 5], COLOURS[place % len(COLOURS)]
                 x = [max(value(row), 0.0) for row in shown]
                 axes.plot(x, y, marker, markersize=5, color=colour, label=network)
             axes.set_xscale(scale)
@@ -159,12 +159,12 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
+def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
     def draw_run(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
-    figure = _draw_grid(summary, traces, draw_run, "force [N]")
+    figure = _draw_trace_grid(summary, traces, draw_run, "force [N]")
     figure.suptitle("Rendered force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
@@ -176,7 +176,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 
-    figure = _draw_grid(summary, traces, draw_run_energy, "energy [J]")
+    figure = _draw_trace_grid(summary, traces, draw_run_energy, "energy [J]")
     figure.suptitle(
         "Energy between hand and actual motion:\nbelow 0 the station is active",
         x=0.01,
@@ -185,7 +185,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
     return figure
 
 
-def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
+def _draw_trace_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
     methods, networks = summary["methods"], summary["networks"]
     with plot_style():
         figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))
@@ -206,7 +206,7 @@ def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str)
     return figure
 
 
-def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def draw_round_trip_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with plot_style():

@@ -31,13 +31,13 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] by place, for translation and rotation.
+    """Return the energies (N, 4, 2) [J] at `HAND` to `ACTUAL`, for translation and rotation.
 
     `MOTOR` is NaN if the log is slower than the joint control.
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
-            f"the result lacks the signals {', '.join(missing)}, which the energy balances need",
+            f"lacks the signals {', '.join(missing)}, which the energy balances need",
             where="result",
             remedy="run a station with a network or a passivity method",
         )
@@ -49,7 +49,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _motion_scale(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _motion_scales(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -66,7 +66,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work (N, 2) [J] of the slave's load."""
+    """Return the work (N, 2) [J] of the load's displayed wrench, for translation and rotation."""
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
@@ -86,13 +86,13 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _motion_scale(scenario)
+    power = scenario.force_scaling.force_scale / _motion_scales(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the passivity method's initial energy (2,) [J]."""
-    scales = _motion_scale(scenario)
+    """Return the passivity method's initial energy (2,) [J], for translation and rotation."""
+    scales = _motion_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -101,7 +101,7 @@ def start_energy(scenario: Scenario) -> Array:
     )
 
 
-def _motion_scale(scenario: Scenario) -> Array:
+def _motion_scales(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return np.where(scales > 0.0, scales, 1.0)

@@ -15,8 +15,8 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
 #: Sample rate of the check [Hz].
-RATE = 1000.0
-_SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
+CHECK_RATE_HZ = 1000.0
+_SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration")
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _STEP_S = 1e-4
 # Search distance beyond the clearance [m].
@@ -40,7 +40,7 @@ class LimitUse:
 
     def __str__(self) -> str:
         share = f"{self.share:.1%}" if np.isfinite(self.share) else "more than all"
-        return f"{share} of its {self.limit} ({self.what}, at {self.time:.3f} s)"
+        return f"{share} of the {self.limit} limit ({self.what}, at {self.time:.3f} s)"
 
 
 def check_trajectory(
@@ -48,8 +48,8 @@ def check_trajectory(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by one period, largest first."""
-    t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
+    """Return the use of every limit in one period of a trajectory, largest first."""
+    t = np.linspace(0, trajectory.period, round(trajectory.period * CHECK_RATE_HZ) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
     qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
     return check_motion(robot, t, q, qd, qdd, progress)
@@ -63,15 +63,15 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by (T, n) joint motions, largest first."""
+    """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
     names, limits = robot.arm.joint_names, robot.limits
-    motion = _evaluate_bodies(robot, q, qd, qdd, progress)
+    motion = _evaluate_motion(robot, q, qd, qdd, progress)
     uses = [
         _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
         _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
         _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
         _largest_use("torque", np.abs(motion.torque) / limits.effort, t, names),
-        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORMS),
+        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORM_NAMES),
         _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
         _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
@@ -87,19 +87,17 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Values of T samples of a motion; `clearance` is required clearance over distance."""
-
+class _MotionSamples:
     torque: Array
     sensor: Array
     workspace: Array
-    clearance: Array
+    clearance: Array  #: required over actual distance
     nearest: list[str]
 
 
-def _evaluate_bodies(
+def _evaluate_motion(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
-) -> _Motion:
+) -> _MotionSamples:
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
@@ -137,7 +135,7 @@ def _evaluate_bodies(
             progress(k / len(q))
     progress(1.0)
     sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
-    return _Motion(torque, sensor, workspace, clearance, nearest)
+    return _MotionSamples(torque, sensor, workspace, clearance, nearest)
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:

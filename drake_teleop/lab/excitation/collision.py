@@ -109,12 +109,12 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 
 
 #: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
-CLEARANCE = 0.005
+CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
 _NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
 # Number of postures that show which shapes remain at a constant distance.
-_FIRST_POSTURES = 20
+_NUM_FIRST_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
 _CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
@@ -123,15 +123,15 @@ _MIN_POSTURES = 5
 # Share of postures below which near capsules count although their shapes were never near.
 _RARE_SHARE = 0.05
 
-_TABLE = "drake_teleop_table"
+_TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
 _PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
-_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+_MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
-_Pair = tuple[GeometryId, GeometryId]
-Parse = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
+_ShapePair = tuple[GeometryId, GeometryId]
+ParseArm = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
 
 
 class Scene:
@@ -143,21 +143,21 @@ class Scene:
     """
 
     def __init__(
-        self, parse: Parse, reserve: Array, *, visuals_count: bool, where: str = ""
+        self, parse: ParseArm, reserve: Array, *, visuals_count: bool, where: str = ""
     ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
-        _make_solid(self.plant, self.scene_graph, visuals_count)
-        _check_sizes(self.plant, self.scene_graph, where)
-        _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE)
+        _add_solid_shapes(self.plant, self.scene_graph, visuals_count)
+        _check_shape_sizes(self.plant, self.scene_graph, where)
+        _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE_NAME)
         finalize_plant(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
-        self._rows = self._link_rows()
+        self._rows = self._find_link_rows()
 
-    def _link_rows(self) -> dict[BodyIndex, int]:
+    def _find_link_rows(self) -> dict[BodyIndex, int]:
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -167,7 +167,7 @@ class Scene:
 
     def find_collision_candidates(
         self, postures: Array, start: Array | None
-    ) -> tuple[dict[_Pair, Array], list[str]]:
+    ) -> tuple[dict[_ShapePair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
 
         Pairs on one link, always near, at constant distance, or in contact at `start` are excluded.
@@ -194,7 +194,7 @@ class Scene:
             query = self.scene_graph.get_query_output_port().Eval(scene_context)
             for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
-            if k + 1 == _FIRST_POSTURES:
+            if k + 1 == _NUM_FIRST_POSTURES:
                 in_context = self.scene_graph.collision_filter_manager(scene_context)
                 _exclude_coaxial(in_context, distances)
         # A new manager: declarations of a manager older than the context have no effect there.
@@ -203,8 +203,8 @@ class Scene:
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
             constant = of_pair.max() < of_pair.min() + _MIN_VARIATION_M
-            neighbours = constant or np.mean(of_pair < CLEARANCE) >= _NEIGHBOUR_SHARE
-            touch = start is not None and of_all[-1] < CLEARANCE
+            neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_SHARE
+            touch = start is not None and of_all[-1] < CLEARANCE_M
             if touch and not neighbours:
                 touching.append(" and ".join(self._body_names(a, b)))
             if touch or neighbours:
@@ -218,10 +218,10 @@ class Scene:
         frames = map(inspector.GetFrameId, shapes)
         return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
-    def capsules(
-        self, candidates: dict[_Pair, Array], postures: Array
+    def bounding_capsules(
+        self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`."""
+        """Return links, ends, radii, pairs and minimum distances of capsules around the shapes."""
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
@@ -238,7 +238,7 @@ class Scene:
             X_LB = X_WB if row < 0 else _transform_of_motion(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
-            if inspector.GetName(shape).endswith(_TABLE):
+            if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _outermost_capsule(shape, capsules) for shape in capsules}
         outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
@@ -259,11 +259,12 @@ class Scene:
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
             distance = _minimum_distance(shape_distances[a, b], capsules_apart[:, k])
-            near, capsules_near = shape_distances[a, b] < CLEARANCE, capsules_apart[:, k] < distance
+            near = shape_distances[a, b] < CLEARANCE_M
+            capsules_near = capsules_apart[:, k] < distance
             if near.sum() >= _MIN_POSTURES:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE) < _RARE_SHARE
+                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_SHARE
             if useful:
                 used.append(k)
                 distances.append(distance)
@@ -271,28 +272,22 @@ class Scene:
 
 
 def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
-    """Return the minimum distance [m] of two capsules from (T,) distances in random postures.
-
-    Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    """
+    # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (
         (of_shapes - capsules_apart)[touching] if touching.sum() >= _MIN_POSTURES else np.zeros(1)
     )
-    free = capsules_apart[of_shapes > CLEARANCE]
+    free = capsules_apart[of_shapes > CLEARANCE_M]
     return float(
-        min(CLEARANCE - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
+        min(CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
     )
 
 
-def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_Pair, Array]) -> None:
-    """Exclude pairs that are near at a constant distance, and fill in their distances.
-
-    Drake's query is slow for them.
-    """
+def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_ShapePair, Array]) -> None:
+    # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
-        first = of_pair[:_FIRST_POSTURES]
-        if first.max() < min(CLEARANCE, first.min() + _MIN_VARIATION_M):
+        first = of_pair[:_NUM_FIRST_POSTURES]
+        if first.max() < min(CLEARANCE_M, first.min() + _MIN_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
@@ -331,7 +326,7 @@ def _add_load(
     )
 
 
-def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
+def _add_solid_shapes(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
@@ -347,7 +342,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: b
             _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
 
 
-def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> None:
+def _check_shape_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
@@ -357,9 +352,9 @@ def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> 
                 continue
             capsule = bounding_capsule(shape)
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
-            if not size <= _MAX_SIZE_M:
+            if not size <= _MAX_SHAPE_SIZE_M:
                 raise DrakeTeleopError(
-                    f"a shape of {body.name()} is {size:.3g} m large, more than {_MAX_SIZE_M:g} m",
+                    f"{body.name()} has a shape of {size:.3g} m (at most {_MAX_SHAPE_SIZE_M:g} m)",
                     where=where,
                     remedy="give all lengths in metres",
                 )

@@ -1,11 +1,11 @@
-"""Criteria of an excitation: condition numbers, A- and D-optimality of the information (T45).
+"""Criteria of an excitation: condition numbers of the regressor V, A- and D-optimality (T45).
 
 =========== ====================================================================================
-kappa_w10   10 columns of V, rows / sigma, columns times diag(1, L, L, L, L^2 ...). The default.
-kappa10     10 columns of V in SI units.
-kappa16     16 columns of [1 V] in SI units.
-A16         rms of the 10 predicted errors of phi over acceptable errors.
-D16         geometric mean of the 16 semi-axes of the standard ellipsoid over acceptable errors.
+kappa_w10   rows of V over noise sigma, columns times powers 0 to 2 of a length L. The default.
+kappa10     V (10 columns) in SI units.
+kappa16     [1 V] (16 columns) in SI units.
+A16         rms of predicted over acceptable errors of phi.
+D16         geometric mean of the error ellipsoid's 16 semi-axes over acceptable errors.
 =========== ====================================================================================
 """
 
@@ -23,7 +23,7 @@ from drake_teleop.load.regressor import regressor
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
 #: Sample rate of A16 and D16 [Hz].
-RATE = 1000.0
+SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
 # [N], [N m].
@@ -33,8 +33,8 @@ _OFFSET_ERRORS = (0.1, 0.005)
 _MIN_EIGENVALUE_RATIO = 1e-13
 
 
-class Scales(NamedTuple):
-    """Scales of the criteria.
+class CriterionScales(NamedTuple):
+    """Noise, length and load that scale the criteria.
 
     Attributes:
         noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
@@ -56,7 +56,7 @@ def characteristic_length(phi: Array) -> float:
 class Criterion:
     """One of `CRITERIA` as a smooth function of the motion."""
 
-    def __init__(self, name: str, scales: Scales) -> None:
+    def __init__(self, name: str, scales: CriterionScales) -> None:
         if name not in CRITERIA:
             raise DrakeTeleopError(
                 f"there is no criterion '{name}'",
@@ -76,7 +76,7 @@ class Criterion:
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return scaled rows (6 T, c) and the information (c, c) per sample."""
+        """Return the scaled regressor (6 T, c) and the information matrix (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -92,12 +92,12 @@ class Criterion:
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(RATE * duration))
+        return float(np.exp(log_value) / np.sqrt(SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the logarithm of the criterion and its gradient by V (T, 6, 10)."""
+        """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
@@ -128,7 +128,7 @@ class Criterion:
 
 @njit(cache=True)
 def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
-    """Fill the gradients dJ/ds, dJ/domega, dJ/dalpha (3,) of a scalar J from dJ/dV (6, 10)."""
+    """Write gradients (3,) of a scalar by s, omega, alpha, from that by the regressor V (6, 10)."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

@@ -11,10 +11,10 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.excitation.check import RATE, LimitUse, check_trajectory
+from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
-    LIMITS,
+    LIMIT_NAMES,
     empty_motions,
     write_limit_uses,
     write_link_motions,
@@ -31,7 +31,7 @@ _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 _CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
 _SMALL_FACTORS, _NUM_SMALL = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
-_HULL_ADVICE = (
+_CONVEX_HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
     " touch in its start posture are ignored"
 )
@@ -93,7 +93,7 @@ def excite(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
-        small = _small_motions(robot, found, problem, seed)
+        small = _shrinking_motions_at_start(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
     return make_checked_excitation(robot, criterion, found, trajectory, uses)
 
@@ -112,7 +112,7 @@ def make_checked_excitation(
         criterion,
         criterion_values(robot, trajectory),
         predicted_deviations(
-            *sensor_motion(robot, trajectory), 1 / RATE, robot.noise, robot.limits.phi
+            *sensor_motion(robot, trajectory), 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi
         ),
         uses,
         np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]).reshape(
@@ -128,7 +128,7 @@ def find_best_within_limits(
     progress: Callable[[float], None] = lambda done: None,
     others: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
-    """Return the best trajectory that passes the check, and its uses.
+    """Return the best trajectory that passes the check, and its uses of the limits.
 
     If none of `found` passes, `others` are checked in their order.
     """
@@ -144,7 +144,7 @@ def find_best_within_limits(
         + (f": the best uses {worst}" if worst else ""),
         where=robot.name,
         remedy="take more time, a longer period or another seed"
-        + (_HULL_ADVICE if worst is not None and worst.limit == "clearance" else ""),
+        + (_CONVEX_HULL_ADVICE if worst is not None and worst.limit == "clearance" else ""),
     )
 
 
@@ -157,8 +157,8 @@ def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, f
 
 
 def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
-    """Return s, omega, alpha (T, 3) of the sensor, in S, over one period at 1 kHz."""
-    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
+    """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
+    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
     motions = empty_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
@@ -177,7 +177,7 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
-            if _largest_uses(robot, trajectory).max() <= 1:
+            if _largest_limit_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
@@ -185,10 +185,9 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
             return
 
 
-def _small_motions(
+def _shrinking_motions_at_start(
     robot: Robot, found: list[Iterate], problem: Problem, seed: int
 ) -> Iterator[FourierTrajectory]:
-    """Yield motions about the start posture, ever smaller."""
     best = sorted(found, key=lambda iterate: iterate.value)[:_NUM_SMALL]
     motions = [iterate.trajectory for iterate in best]
     rng = np.random.default_rng(seed)
@@ -197,18 +196,17 @@ def _small_motions(
     for factor in _SMALL_FACTORS:
         for motion in motions:
             small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
-            # `check_trajectory` measures the true clearance.
-            if _largest_uses(robot, small)[:-1].max() <= 1:
+            # The last use is that of capsules; `check_trajectory` measures the true clearance.
+            if _largest_limit_uses(robot, small)[:-1].max() <= 1:
                 yield small
 
 
-def _largest_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
-    """Return the largest use of each of `LIMITS` at 1 kHz; its clearance is that of capsules."""
-    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
+def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
+    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
     motions = empty_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
-    smooth, largest = np.empty((2, len(LIMITS)))
-    gradients = np.empty((len(LIMITS), 3, *joints[0].shape))
+    smooth, largest = np.empty((2, len(LIMIT_NAMES)))
+    gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))
     write_limit_uses(
         robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
     )

@@ -12,23 +12,23 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.criteria import regressor_gradient
 from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,
-    pull_back,
-    seed_joint_torque,
-    seed_point,
-    seed_vector,
-    seed_wrench,
-    to_link,
-    to_world,
+    add_point_to_seed,
+    add_torque_to_seeds,
+    add_vector_to_seed,
+    add_wrench_to_seed,
+    pull_back_seeds,
+    rotate_to_link,
+    rotate_to_world,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, inverse_dynamics, link_motions
 
-LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
+LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
-CLEARANCE_SCALE = 0.1
+CLEARANCE_SCALE_M = 0.1
 # Smallest weight in the gradient of a smooth maximum.
-_MIN_WEIGHT = 1e-7
+_MIN_GRADIENT_WEIGHT = 1e-7
 # Value that replaces all distances above clearance plus scale [m].
 _FAR_DISTANCE_M = 1.0
 
@@ -76,36 +76,36 @@ def half_ranges_for_sampling(q_half: Array) -> Array:
 
 @njit(cache=True)
 def write_link_motions(table, q, qd, qdd, motions):
-    """Write `link_motions` of T samples (q, qd, qdd (T, n)) into `motions` (T, n+1, 21)."""
+    """Write all links' motions at T samples q, qd, qdd (T, n) into `motions` (T, n+1, 21)."""
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
 
 
 @njit(cache=True)
 def write_sensor_motion(motions, out):
-    """Write s, omega, alpha of the sensor, in S, into `out` (3, T, 3)."""
+    """Write specific force, omega, alpha of the sensor, in S, into `out` (3, T, 3)."""
     for t in range(len(motions)):
         motion = motions[t, -1]
         for k in range(3):
-            x = to_link(motion, (motion[3 * k], motion[3 * k + 1], motion[3 * k + 2]))
+            x = rotate_to_link(motion, (motion[3 * k], motion[3 * k + 1], motion[3 * k + 2]))
             out[k, t, 0], out[k, t, 1], out[k, t, 2] = x
 
 
 @njit(cache=True)
 def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
-    """Add dJ/d(q, qd, qdd) of a scalar J to `gradient` (3, T, n), from dJ/dV (T, 6, 10)."""
+    """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
     rows = motions.shape[1]
     seeds = np.zeros((rows, SEED_SIZE))
     c, virtual = np.zeros(rows - 1), np.zeros((rows, 6))
     g = np.empty((3, 3))
     for t in range(len(motions)):
         motion = motions[t, -1]
-        omega = to_link(motion, (motion[3], motion[4], motion[5]))
+        omega = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
         regressor_gradient(omega, g_V[t], g[0], g[1], g[2])
         seeds[-1] = 0.0
         for k in range(3):
-            seed_vector(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
-        pull_back(
+            add_vector_to_seed(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
+        pull_back_seeds(
             table, motions[t], qd[t], qdd[t], c, virtual, seeds,
             gradient[0, t], gradient[1, t], gradient[2, t],
         )  # fmt: skip
@@ -113,7 +113,7 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 
 @njit(cache=True)
 def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
-    """Write the largest use of each of `LIMITS` over all samples, with gradients (T47).
+    """Write the largest use of each of `LIMIT_NAMES` over all samples, with gradients (T47).
 
     Outputs: smooth and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
     joint positions, velocities and accelerations.
@@ -179,7 +179,7 @@ def _write_torque_use(
             use[t, j] = abs(tau[t, j]) / limits.effort[j]
     largest[3], smooth[3] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_WEIGHT:
+        if use[t].max() < _MIN_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for j in range(n):
@@ -187,14 +187,14 @@ def _write_torque_use(
             # Table columns 22 and 23: rotor inertia and joint damping.
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
-        seed_joint_torque(table, motions[t], c, virtual, seeds)
+        add_torque_to_seeds(table, motions[t], c, virtual, seeds)
         _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
 def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
-    pull_back(
+    pull_back_seeds(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
         gradient[0, t], gradient[1, t], gradient[2, t],
     )  # fmt: skip
@@ -209,9 +209,9 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
     omega = np.empty(3)
     for t in range(T):
         motion = motions[t, -1]
-        x[t, 6], x[t, 7], x[t, 8] = to_link(motion, (motion[0], motion[1], motion[2]))
-        x[t, 9], x[t, 10], x[t, 11] = to_link(motion, (motion[6], motion[7], motion[8]))
-        omega[0], omega[1], omega[2] = to_link(motion, (motion[3], motion[4], motion[5]))
+        x[t, 6], x[t, 7], x[t, 8] = rotate_to_link(motion, (motion[0], motion[1], motion[2]))
+        x[t, 9], x[t, 10], x[t, 11] = rotate_to_link(motion, (motion[6], motion[7], motion[8]))
+        omega[0], omega[1], omega[2] = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
         non_contact_wrench_into(x[t, 6:9], omega, x[t, 9:12], limits.phi, x[t, :6])
         for k in range(4):
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
@@ -220,7 +220,7 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
     largest[4], smooth[4] = _smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
-        if use[t].max() < _MIN_WEIGHT:
+        if use[t].max() < _MIN_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(4):
@@ -229,9 +229,9 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
                 g[k, i] = factor * x[t, 3 * k + i]
         motion = motions[t, -1]
         force, torque = (g[0, 0], g[0, 1], g[0, 2]), (g[1, 0], g[1, 1], g[1, 2])
-        seed_wrench(motion, limits.phi, force, torque, seeds[-1])
-        seed_vector(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
-        seed_vector(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
+        add_wrench_to_seed(motion, limits.phi, force, torque, seeds[-1])
+        add_vector_to_seed(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
+        add_vector_to_seed(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
         _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
@@ -245,14 +245,14 @@ def _write_workspace_use(
     for t in range(T):
         motion = motions[t, -1]
         for k in range(P):
-            p = to_world(motion, limits.points_S[k])
+            p = rotate_to_world(motion, limits.points_S[k])
             for i in range(3):
                 x = motion[9 + i] + p[i] - limits.box_middle[i]
                 use[t, 3 * k + i] = abs(x) / limits.box_half[i]
                 sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
     largest[5], smooth[5] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_WEIGHT:
+        if use[t].max() < _MIN_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(P):
@@ -262,7 +262,7 @@ def _write_workspace_use(
                 use[t, i + 1] * sign[t, i + 1],
                 use[t, i + 2] * sign[t, i + 2],
             )
-            seed_point(motions[t, -1], limits.points_S[k], g, seeds[-1])
+            add_point_to_seed(motions[t, -1], limits.points_S[k], g, seeds[-1])
         _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
@@ -283,16 +283,16 @@ def _write_clearance_use(
             a, b = limits.pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
             distance = _FAR_DISTANCE_M
-            if not _is_far(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE):
+            if not _is_farther_apart(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE_M):
                 distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
-            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE
+            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE_M
     largest[6], smooth[6] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_WEIGHT:
+        if use[t].max() < _MIN_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _MIN_WEIGHT:
+            if use[t, k] < _MIN_GRADIENT_WEIGHT:
                 continue
             a, b = limits.pairs[k]
             _segment_distance(ends[t, a], ends[t, b], nearest)
@@ -302,18 +302,18 @@ def _write_clearance_use(
                 if row < 0:
                     continue
                 along, towards = nearest[side], (1.0 if side == 0 else -1.0)
-                factor = -use[t, k] / CLEARANCE_SCALE * towards
+                factor = -use[t, k] / CLEARANCE_SCALE_M * towards
                 point = limits.capsule_ends[capsule, 0] + along * (
                     limits.capsule_ends[capsule, 1] - limits.capsule_ends[capsule, 0]
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
-                seed_point(motions[t, row], point, g, seeds[row])
+                add_point_to_seed(motions[t, row], point, g, seeds[row])
         _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
 def capsule_distances(motions, rows, ends, radii, pairs):
-    """Return the distances (T, K) of capsule pairs [m]."""
+    """Return the distances (T, K) of K capsule pairs [m]."""
     distances = np.empty((len(motions), len(pairs)))
     placed, nearest = np.empty(ends.shape), np.empty(5)
     for t in range(len(motions)):
@@ -332,28 +332,28 @@ def _transform_capsules(motions, rows, ends, placed):
             if row < 0:
                 placed[k, e] = ends[k, e]
                 continue
-            p = to_world(motions[row], ends[k, e])
+            p = rotate_to_world(motions[row], ends[k, e])
             for i in range(3):
                 placed[k, e, i] = motions[row, 9 + i] + p[i]
 
 
 @njit(cache=True)
-def _is_far(first, second, enough):
-    """Return True only if two segments (2, 3) are farther apart than `enough` [m]."""
+def _is_farther_apart(first, second, distance):
+    # Sufficient condition for two segments (2, 3).
     between = length_a = length_b = 0.0
     for i in range(3):
         d = 0.5 * (first[0, i] + first[1, i] - second[0, i] - second[1, i])
         a, b = 0.5 * (first[1, i] - first[0, i]), 0.5 * (second[1, i] - second[0, i])
         between, length_a, length_b = between + d * d, length_a + a * a, length_b + b * b
     # (a + b + c)^2 <= 3 (a^2 + b^2 + c^2)
-    return between > 3 * (length_a + length_b + enough * enough)
+    return between > 3 * (length_a + length_b + distance * distance)
 
 
 @njit(cache=True)
 def _segment_distance(first, second, nearest):
     """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
-    `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
+    Write to `nearest` (5,): positions on both segments (0 to 1), unit vector to the first.
     """
     dd = ee = de = dr = er = 0.0
     for i in range(3):

@@ -30,35 +30,35 @@ _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 
 @njit(cache=True)
-def to_world(motion, a):
+def rotate_to_world(motion, a):
     return apply_matrix(matrix_at(motion, 12), a)
 
 
 @njit(cache=True)
-def to_link(motion, a):
+def rotate_to_link(motion, a):
     return apply_matrix(transposed(matrix_at(motion, 12)), a)
 
 
 @njit(cache=True)
-def seed_vector(motion, place, gradient, seed):
-    """Add to `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame."""
-    g = to_world(motion, gradient)
+def add_vector_to_seed(motion, place, gradient, seed):
+    """Add to a link's `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in its frame."""
+    g = rotate_to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, vector_at(motion, place)))
 
 
 @njit(cache=True)
-def seed_point(motion, point, gradient, seed):
-    """Add to `seed` a derivative, in W, by the position of a point (3,) fixed to the link."""
+def add_point_to_seed(motion, point, gradient, seed):
+    """Add to a link's `seed` a derivative, in W, by the position of a point (3,) fixed to it."""
     add_into(seed, _P, gradient)
-    add_into(seed, _THETA, cross(to_world(motion, point), gradient))
+    add_into(seed, _THETA, cross(rotate_to_world(motion, point), gradient))
 
 
 @njit(cache=True)
-def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add to `seed` (21,) derivatives by the wrench of a load phi, both in the link's frame."""
-    s = to_link(motion, vector_at(motion, _S))
-    w = to_link(motion, vector_at(motion, _OMEGA))
+def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
+    """Add to a link's `seed` (21,) derivatives by the wrench of its load phi, both in its frame."""
+    s = rotate_to_link(motion, vector_at(motion, _S))
+    w = rotate_to_link(motion, vector_at(motion, _OMEGA))
     h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
     lever = cross(g_torque, h)
     gs = plus(scale_vector(phi[0], g_force), lever)
@@ -67,15 +67,15 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
     gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
     gw = plus(gw, cross(apply_matrix(inertia, w), g_torque))
     gw = plus(gw, apply_matrix(inertia, cross(g_torque, w)))
-    seed_vector(motion, _S, gs, seed)
-    seed_vector(motion, _OMEGA, gw, seed)
-    seed_vector(motion, _ALPHA, ga, seed)
+    add_vector_to_seed(motion, _S, gs, seed)
+    add_vector_to_seed(motion, _OMEGA, gw, seed)
+    add_vector_to_seed(motion, _ALPHA, ga, seed)
     return s, w
 
 
 @njit(cache=True)
-def seed_joint_torque(table, motions, c, virtual, seeds):
-    """Add the seeds of J = c . tau, with joint torques tau without rotor inertia and damping.
+def add_torque_to_seeds(table, motions, c, virtual, seeds):
+    """Add to `seeds` the gradients of c . tau; torques tau exclude rotor inertia and damping.
 
     Write the link velocities for joint velocities c into `virtual` (n+1, 6).
     """
@@ -94,25 +94,25 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
                 w = plus(w, along)
         virtual[row, 0], virtual[row, 1], virtual[row, 2] = v
         virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
-        v_L, w_L = to_link(motion, v), to_link(motion, w)
-        s, omega = seed_wrench(motion, phi, v_L, w_L, seeds[row])
-        alpha = to_link(motion, vector_at(motion, _ALPHA))
+        v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
+        s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
+        alpha = rotate_to_link(motion, vector_at(motion, _ALPHA))
         h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
         force = plus(scale_vector(phi[0], s), cross(alpha, h))
         force = plus(force, cross(omega, cross(omega, h)))
         torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
         torque = plus(torque, cross(h, s))
-        F, N = to_world(motion, force), to_world(motion, torque)
+        F, N = rotate_to_world(motion, force), rotate_to_world(motion, torque)
         add_into(seeds[row], _V, F)
         add_into(seeds[row], _W, N)
         add_into(seeds[row], _THETA, plus(cross(F, v), cross(N, w)))
 
 
 @njit(cache=True)
-def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
+def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
     """Add to `g_q`, `g_qd`, `g_qdd` (n,) the gradients that follow from the seeds of all links.
 
-    `c` and `virtual` are those of `seed_joint_torque`, or zeros.
+    `c` and `virtual` are those of `add_torque_to_seeds`, or zeros.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLUE
-from drake_teleop.lab.excitation.check import RATE
+from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
@@ -27,9 +27,9 @@ from drake_teleop.station.film import (
     set_plain_background,
 )
 
-_TABLE_COLOUR, _BONE_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
+_TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
-_BONE_RADIUS_RATIO = 0.04  # radius of a bone over its length
+_LINK_RADIUS_RATIO = 0.04  # radius of a bone over its length
 # Camera position from the middle of the motion, in sizes of the arm.
 _CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
 
@@ -46,7 +46,7 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     force = np.linalg.norm(
         non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.phi)[:, :3], axis=1
     )
-    samples = np.minimum(np.rint(times * RATE).astype(int), len(force) - 1)
+    samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
     film = ReplayFile(
         f"Excitation of {robot.name}",
         times,
@@ -93,9 +93,9 @@ def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
         body = plant.get_body(BodyIndex(k))
         visuals = plant.GetVisualGeometriesForBody(body)
         shapes = visuals or plant.GetCollisionGeometriesForBody(body)
-        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _BONE_COLOUR)
+        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
         for number, p_BJ in enumerate(() if visuals else _joint_positions(robot, context, body)):
-            _add_bone(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
+            _add_link_cylinder(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
 
 
 def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
@@ -110,9 +110,9 @@ def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterato
             yield p_BJ
 
 
-def _add_bone(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
+def _add_link_cylinder(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
     length = float(np.linalg.norm(p_BJ))
-    meshcat.SetObject(name, Cylinder(_BONE_RADIUS_RATIO * length, length), _BONE_COLOUR)
+    meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
     along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
     meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 

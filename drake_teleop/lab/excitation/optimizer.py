@@ -15,7 +15,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
-    LIMITS,
+    LIMIT_NAMES,
     Limits,
     criterion_gradient,
     empty_motions,
@@ -32,7 +32,7 @@ Bounds = list[tuple[float | None, float | None]]
 # Samples of a period per harmonic.
 _SAMPLES_PER_HARMONIC = 24
 # Size of random motions, as a share of the speed and acceleration limits.
-_RELATIVE_SIZE = 0.35
+_RANDOM_MOTION_SHARE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +56,11 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Criterion and limits at one point.
+    """Criterion and use of limits at one point of the search.
 
     Attributes:
         log_criterion: smooth logarithm of the criterion.
-        uses: (7,) smooth largest use of each of `LIMITS`.
+        uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
         gradients: (8, unknowns) gradients of criterion (first) and uses.
         largest_use: exact largest use of any limit.
     """
@@ -86,7 +86,7 @@ class Problem:
         self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period / samples))
         self._motions = empty_motions(samples, n)
         self._vectors = np.empty((3, samples, 3))
-        self._gradients = np.empty((1 + len(LIMITS), 3, samples, n))
+        self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         n = len(self.task.home)
@@ -94,12 +94,12 @@ class Problem:
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion."""
+        """Return the unknowns of a random motion, near or far from the home posture."""
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
         spread = np.tile(
-            np.repeat(_RELATIVE_SIZE * np.minimum(size, limits.q_half), task.harmonics - 1), 2
+            np.repeat(_RANDOM_MOTION_SHARE * np.minimum(size, limits.q_half), task.harmonics - 1), 2
         )
         q0 = task.home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
@@ -122,7 +122,7 @@ class Problem:
         s, omega, alpha = self._vectors
         value, g_V = task.criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
         criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
-        smooth, largest = np.empty((2, len(LIMITS)))
+        smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
             task.table, *joints, self._motions, task.limits, limit_sharpness,
             smooth, largest, self._gradients[1:],
@@ -147,7 +147,7 @@ class Problem:
 
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
-MARGIN = 0.985
+LIMIT_SHARE = 0.985
 # Largest use of a feasible iterate on the grid.
 _MAX_FEASIBLE_USE = 0.9885
 
@@ -157,7 +157,7 @@ _NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
 _SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
-_TOLERANCE = 1e-5
+_SLSQP_TOLERANCE = 1e-5
 # A start ends without a feasible iterate after so many evaluations, or after the first stage of
 # SLSQP outside this factor of the best.
 _MAX_INFEASIBLE_EVALUATIONS, _MAX_RATIO_TO_BEST = 250, 1.08
@@ -186,9 +186,9 @@ def minimise_criterion(
 ) -> list[Iterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `seconds` of thread CPU time replace `starts`; then runs differ.
+    `seconds` of thread CPU time replace `starts`, but make results irreproducible.
     """
-    search = _Search(problem, starts, seconds, progress)
+    search = _DescentSearch(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):
         for candidate in search.candidates(np.random.default_rng(seed)):
             if seconds is None and search.start == starts:
@@ -205,7 +205,7 @@ class _TimeOutError(Exception): ...
 class _InfeasibleStartError(Exception): ...
 
 
-class _Search:
+class _DescentSearch:
     def __init__(
         self,
         problem: Problem,
@@ -273,11 +273,11 @@ class _Search:
             bounds=self._problem.bounds(x),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, *sharpness: MARGIN - self._evaluate_once(x, *sharpness).uses,
+                "fun": lambda x, *sharpness: LIMIT_SHARE - self._evaluate_once(x, *sharpness).uses,
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (criterion_sharpness, limit_sharpness),
             },
-            options={"maxiter": iterations, "ftol": _TOLERANCE},
+            options={"maxiter": iterations, "ftol": _SLSQP_TOLERANCE},
         ).x
         return found
 
@@ -285,7 +285,7 @@ class _Search:
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
-        excess = np.maximum(point.uses - MARGIN, 0)
+        excess = np.maximum(point.uses - LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 

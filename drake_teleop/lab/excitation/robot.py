@@ -15,8 +15,8 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
-from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
+from drake_teleop.lab.excitation.collision import CLEARANCE_M, ParseArm, Scene
+from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits, half_ranges_for_sampling
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -32,7 +32,7 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES = 1000  # random postures for distances of shapes
 # Usable share of joint limits; the rest is for tracking errors and feedback.
-_JOINT_SHARE = 0.8
+_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
@@ -43,9 +43,9 @@ _DEFAULT_PAYLOAD_KG = 2.0
 _MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
-_POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
-_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
-_UNLIMITED = np.zeros(3), np.full(3, np.inf)
+_WORKSPACE_POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
+_WORKSPACE_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
+_UNLIMITED_BOX = np.zeros(3), np.full(3, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Robot:
     sensor_frame: Frame
     arm: ArmModel
     limits: Limits
-    scales: Scales
+    scales: CriterionScales
     noise: SensorNoise
     home: Array
     assumptions: tuple[str, ...]
@@ -88,7 +88,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     own = scenario.slave.model != ""
     scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
     scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
-    lower, upper = np.array(_BOX_W)
+    lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
         scene,
         "the station's slave",
@@ -96,8 +96,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
         start=slave.start,
-        points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
-        box=_UNLIMITED if own else ((upper + lower) / 2, (upper - lower) / 2),
+        points_S=np.array([np.zeros(3), slave.tip] if own else _WORKSPACE_POINTS_S),
+        box=_UNLIMITED_BOX if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
         folders=folders,
     )
@@ -146,11 +146,11 @@ def RobotFromModel(
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
             raise DrakeTeleopError(
-                f"the model already contains {load[0]:.3g} kg beyond the sensor",
+                f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor",
                 where="--payload",
-                remedy="give the total mass beyond the sensor",
+                remedy="give the total mass beyond the sensor, or remove the option",
             )
-        reserve = _compact_body_load(mass - load[0])
+        reserve = _make_compact_load(mass - load[0])
     with translate_drake_errors(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
@@ -165,7 +165,7 @@ def RobotFromModel(
         sensor_hz,
         start=None,
         points_S=np.zeros((1, 3)),
-        box=_UNLIMITED,
+        box=_UNLIMITED_BOX,
         assumptions=assumptions + completed,
         folders=folders,
     )
@@ -193,17 +193,17 @@ def _make_robot(
         assumptions.append(
             f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
         )
-    rows, ends, radii, pairs, distances = scene.capsules(candidates, postures)
+    rows, ends, radii, pairs, distances = scene.bounding_capsules(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
     force = _FORCE_SHARE * min(sensor.force_range)
     torque = _TORQUE_SHARE * min(sensor.torque_range)
     alpha = sensor.angular_acceleration_range
     limits = Limits(
         q_middle=middle,
-        q_half=_JOINT_SHARE * half,
-        velocity=_JOINT_SHARE * arm.velocity_limit,
+        q_half=_JOINT_LIMIT_SHARE * half,
+        velocity=_JOINT_LIMIT_SHARE * arm.velocity_limit,
         acceleration=arm.acceleration_limit,
-        effort=_JOINT_SHARE * arm.effort_limit,
+        effort=_JOINT_LIMIT_SHARE * arm.effort_limit,
         phi=phi,
         sensor=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
@@ -214,7 +214,7 @@ def _make_robot(
         capsule_radius=radii,
         pairs=pairs,
         distances=distances,
-        clearance=CLEARANCE,
+        clearance=CLEARANCE_M,
     )
     return Robot(
         name=name,
@@ -224,7 +224,7 @@ def _make_robot(
         sensor_frame=scene.sensor_frame,
         arm=arm,
         limits=limits,
-        scales=Scales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
+        scales=CriterionScales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
         noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home=middle if start is None else start,
         assumptions=tuple(assumptions),
@@ -232,13 +232,13 @@ def _make_robot(
     )
 
 
-def _read_arm(parse: Parse) -> ArmModel:
+def _read_arm(parse: ParseArm) -> ArmModel:
     plant = MultibodyPlant(0.0)
     instance, frame = parse(plant)
     finalize_plant(plant)
     return ArmModelFromPlant(plant, instance, frame.name())
 
 
-def _compact_body_load(mass: float) -> Array:
+def _make_compact_load(mass: float) -> Array:
     com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
     return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

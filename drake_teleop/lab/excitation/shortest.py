@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.lab.excitation.check import RATE
+from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import (
     Excitation,
@@ -27,7 +27,7 @@ from drake_teleop.lab.excitation.excite import (
     sensor_motion,
 )
 from drake_teleop.lab.excitation.limits import (
-    LIMITS,
+    LIMIT_NAMES,
     criterion_gradient,
     write_limit_uses,
     write_link_motions,
@@ -59,7 +59,7 @@ RELIABLE_PROBABILITY = 0.95
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
-_MAX_LOG_STEP = 0.15
+_MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor;
 # additional margin after a round that missed the tolerance.
 _MAX_ROUNDS, _MAX_VAIN_ROUNDS, _PROGRESS_RATIO, _FACTOR_MARGIN = 20, 1, 0.99, 1.005
@@ -79,7 +79,7 @@ _REGULARISATION = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class ShortestMotion:
-    """Checked motion; `reached` (k,) is z d_k over the tolerances, at most 1."""
+    """Checked motion; `reached` (k,): predicted errors over tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
@@ -123,7 +123,7 @@ def design_shortest_motion(
             continue
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
-        covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
+        covariance = predicted_covariance(*motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi)
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_START_MISFIT else None
@@ -154,7 +154,7 @@ def design_shortest_motion(
 
 
 def sidak_factor(count: int) -> float:
-    """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
+    """Return z; `count` numbers are within z deviations together with 95 % probability (Sidak)."""
     return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
 
@@ -178,7 +178,7 @@ class ShortestProblem(Problem):
         self._noise = white_noise_densities(robot.noise, robot.limits.phi)
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
-        self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
+        self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
@@ -203,7 +203,7 @@ class ShortestProblem(Problem):
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
-            for step in (-_MAX_LOG_STEP, _MAX_LOG_STEP)
+            for step in (-_MAX_LOG_PERIOD_STEP, _MAX_LOG_PERIOD_STEP)
         )
         low, high = (float(each) for each in around)
         return [(None, None)] * (len(x) - 1) + [(low, high)]
@@ -222,7 +222,7 @@ class ShortestProblem(Problem):
         g[:2] = 0.0
         use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
-        smooth, largest = np.empty((2, len(LIMITS)))
+        smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
             task.table,
             q,
@@ -253,7 +253,7 @@ class ShortestProblem(Problem):
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return the standard deviations (k,) in white noise, over the required ones."""
+        """Return the predicted deviations (k,) with white noise, over the required ones."""
         return np.sqrt(self._variances(self._regression_rows(*motion), period)[0])
 
     def _regression_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
@@ -262,11 +262,9 @@ class ShortestProblem(Problem):
         return rows / self._roots[:, np.newaxis]
 
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
-        """Return variances (k,) d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
-
-        G is the information of weighted least squares; B contains the noise densities; e_k is a row
-        of `errors` (sandwich, White, Econometrica 1980).
-        """
+        # Variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k, u_k = G^-1 B v_k: G is the information of
+        # weighted least squares; B contains the noise densities; e_k is a row of `errors`
+        # (sandwich, White, Econometrica 1980).
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
         B = share * (flat.T @ (self._noise @ rows).reshape(flat.shape))
@@ -291,7 +289,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6), relative to the wrench's."""
+    """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

@@ -13,7 +13,7 @@ from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file, write_picture
-from drake_teleop.lab.new_station.picture import start_picture
+from drake_teleop.lab.new_station.picture import draw_start
 from drake_teleop.lab.new_station.plan import Plan, plan_station
 from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
 from drake_teleop.lab.run import run_command
@@ -77,7 +77,7 @@ def new_command(
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
                 raise DrakeTeleopError(
-                    "does not describe the given models (their names cannot be written)",
+                    "does not describe the given models, whose names YAML cannot contain",
                     where=str(scenario),
                     remedy="use simpler names of files and frames",
                 )
@@ -87,9 +87,9 @@ def new_command(
                 each.rmdir()
         raise
     picture = folder / "start.png"
-    write_picture(picture, start_picture(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
+    write_picture(picture, draw_start(plan, f"{arm.stem}, sensor frame {sensor_frame}"))
     if not quiet:
-        _print(plan, scenario, picture)
+        _print_plan(plan, scenario, picture)
     return run_command(scenario, folder / "first_run", quiet=quiet)
 
 
@@ -97,7 +97,7 @@ def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _print(plan: Plan, scenario: Path, picture: Path) -> None:
+def _print_plan(plan: Plan, scenario: Path, picture: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

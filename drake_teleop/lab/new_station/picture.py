@@ -23,13 +23,13 @@ from drake_teleop.station.slave.posture_shapes import PostureShapes
 _LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
 _BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0), (0.78, 0.66, 0.5)
 _WALL_THICKNESS_M = 0.1
-_LIGHT = np.array([0.35, -0.5, 0.8])
-_VIEWS = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth, from the direction of the tool
+_LIGHT_DIRECTION = np.array([0.35, -0.5, 0.8])
+_VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from the tool
 _WALL_DIVISIONS = 8  # divisions of the wall in the picture
-_TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
+_TRIAD_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
 _SPIRAL_STEPS = np.arange(0.5, 250.0)
-_DIRECTIONS = np.column_stack(
+_SAMPLED_DIRECTIONS = np.column_stack(
     [
         np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
         * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
@@ -40,12 +40,12 @@ _DIRECTIONS = np.column_stack(
 )
 
 
-def start_picture(plan: Plan, title: str) -> Figure:
-    """Draw the shapes at the start; meshes as convex hulls."""
+def draw_start(plan: Plan, title: str) -> Figure:
+    """Draw the shapes in the start posture; meshes as convex hulls."""
     shapes, wall = plan.shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
-    triangles, colours = [*triangles, faces], [*colours, _shade(faces, _WALL_COLOUR)]
+    triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
     chain = _joint_chain_points(plan)
     points = np.vstack([surfaces.reshape(-1, 3), chain])
@@ -54,7 +54,7 @@ def start_picture(plan: Plan, title: str) -> Figure:
         figure = Picture(figsize=(10.0, 5.0), facecolor="white")
         figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
         side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
-        for k, (elevation, azimuth) in enumerate(_VIEWS):
+        for k, (elevation, azimuth) in enumerate(_VIEW_ANGLES_DEG):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
             collection = Poly3DCollection(
                 surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4
@@ -62,7 +62,7 @@ def start_picture(plan: Plan, title: str) -> Figure:
             axes.add_collection3d(collection)
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
             _draw_plane(axes, lower, upper, plan.plane)
-            _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
+            _draw_triad(axes, shapes, _TRIAD_LENGTH_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.plane)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
@@ -92,13 +92,13 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
         for points in hulls:
             faces = _hull_triangles(points)
             triangles.append(faces)
-            colours.append(_shade(faces, colour))
+            colours.append(_shade_triangles(faces, colour))
     return triangles, colours
 
 
 def _hull_triangles(points: Array) -> Array:
-    if len(points) > len(_DIRECTIONS):
-        points = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
+    if len(points) > len(_SAMPLED_DIRECTIONS):
+        points = points[np.unique((points @ _SAMPLED_DIRECTIONS.T).argmax(axis=0))]
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -111,7 +111,7 @@ def _hull_triangles(points: Array) -> Array:
 
 
 def _box_triangles(top: Array, size: Array) -> Array:
-    """Return small triangles (k, 3, 3), which sort better by depth than large ones."""
+    # Small triangles are better sorted by depth than large ones.
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
     cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
         _WALL_DIVISIONS,
@@ -127,10 +127,10 @@ def _box_triangles(top: Array, size: Array) -> Array:
     return triangles
 
 
-def _shade(triangles: Array, colour: tuple[float, float, float]) -> Array:
+def _shade_triangles(triangles: Array, colour: tuple[float, float, float]) -> Array:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    bright = 0.72 + 0.28 * (normals @ (_LIGHT / np.linalg.norm(_LIGHT)))
+    bright = 0.72 + 0.28 * (normals @ (_LIGHT_DIRECTION / np.linalg.norm(_LIGHT_DIRECTION)))
     return np.clip(np.outer(bright, colour), 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Start of an arm with the tool down, chosen among random postures.
+"""Start of an arm whose tool points down, chosen among random postures.
 
 Among the best postures (`posture_scores`), the one with the largest reachable cube is the start.
 The tool is along an axis of S, the z axis of frame A; S and A are the same for tools along z_S.
@@ -68,7 +68,7 @@ _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
 _MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
 MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_MAX_JOINT_STEP = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
 _SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
@@ -79,7 +79,7 @@ _COST_PER_M, _COST_OF_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
 
 
 class Place(NamedTuple):
-    """Start of an arm with the tool down.
+    """Start of an arm whose tool points down.
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
@@ -88,7 +88,7 @@ class Place(NamedTuple):
         half: half edge of the reachable cube around the start [m].
         room: smallest distance of a joint to its limit, over half the joint's range.
         score: merit of the posture, see `posture_scores`, without the cost of overlaps.
-        wall: edge of the free wall [m].
+        wall: edge of the wall that fits below the tool [m].
         vertical: True if the arm can only move up and down by `half`.
         overlaps: True if shapes of the arm overlap.
     """
@@ -151,7 +151,7 @@ def find_place(
     plane: float = 0.0,
     axis: str = "z",
 ) -> Place:
-    """Find a start with the tool down.
+    """Find a start at which the tool points down.
 
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
@@ -165,7 +165,7 @@ def find_place(
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[Place]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
-        solved = _candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
+        solved = _solve_candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
         found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.overlaps for place in found):
             break
@@ -178,7 +178,7 @@ def find_place(
                 _with_reachable_cube(pointed, place, is_free, vertical)
                 for place in places[:_NUM_CUBES]
             ]
-            best = max(cubes, key=_merit, default=None)
+            best = max(cubes, key=_place_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
@@ -194,10 +194,7 @@ def find_place(
 
 
 def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
-    """Return the rows of q (k, n) with room for motion, and that the motors can hold if possible.
-
-    If necessary with less load, and then without any condition.
-    """
+    # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = joint_margins(arm, q) > _MIN_MARGIN
     for share in (1.0, MIN_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
@@ -232,7 +229,7 @@ def _rows_to_solve(
         yield few[clear]
 
 
-def _candidates(
+def _solve_candidates(
     arm: ArmModel, postures: Postures, region: Region, is_free: bool
 ) -> Iterator[Place]:
     if not is_free:  # position and orientation are coupled
@@ -259,7 +256,7 @@ def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
 
 
 def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Array, Array, bool]]:
-    """Yield joint positions near q, the pose, and whether `slave.position` gives them."""
+    """Yield joint positions near q, their pose, and whether `slave.position` specifies them."""
     position = np.round(position, 2)
     for yaw_deg in _TOOL_YAWS_DEG:
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
@@ -275,11 +272,11 @@ def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Ar
 
 
 def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
-    """Return the place with the largest free wall; its score is reduced by the cost of overlaps."""
+    """Return the place with its largest free wall; overlaps reduce its score."""
     if shapes is None:
         return place
     shapes.move_to(place.q)
-    walls = _move_walls(shapes)
+    walls = _move_walls_below_tool(shapes)
     depths = dict.fromkeys(walls, 0.0)
     cost = max(
         region.plane - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
@@ -303,8 +300,7 @@ def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Regio
     return place._replace(score=score, wall=WALL_EDGES_M[rank], overlaps=overlaps)
 
 
-def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
-    """Move the walls below the tool, into the space of wall and motion; return their edges."""
+def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
     plant, walls = shapes.plant, {}
     x, y, z = lowest_tool_point(shapes)
     middle = RigidTransform([x, y, z + (_WALL_ABOVE_M - _WALL_BELOW_M) / 2.0])
@@ -326,12 +322,12 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
 
 
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
-    """Return the reach of bodies beyond S along an axis of S [m]."""
+    """Return how far bodies extend beyond S along an axis of S [m]."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
 
-def _merit(place: Place) -> tuple[float, float, bool, float]:
+def _place_merit(place: Place) -> tuple[float, float, bool, float]:
     enough_room, enough_space = (
         min(place.room, _SUFFICIENT_MARGIN),
         min(place.half, _SUFFICIENT_HALF_M),
@@ -340,7 +336,7 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
 
 
 def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    moves = _ik_reaches if is_free else _pose_reaches
+    moves = _reaches_by_ik if is_free else _reaches_by_position
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
@@ -355,43 +351,43 @@ def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: b
     return place._replace(half=largest, room=room, vertical=vertical)
 
 
-def _ik_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _reaches_by_ik(arm: ArmModel, place: Place, displacement: Array) -> bool:
     q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
-    return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_TURN)
+    return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_STEP)
 
 
-def _pose_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _reaches_by_position(arm: ArmModel, place: Place, displacement: Array) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement))
 
 
-_MIN_COS = 0.75  # smallest cosine of the angle between tool and axis
+_MIN_AXIS_COSINE = 0.75  # smallest cosine of the angle between tool and axis
 #: Opposite of each axis.
 OPPOSITE_AXIS = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
-_ROUNDING_M = 1e-9
-_MIN_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
+_ROUNDING_TOLERANCE_M = 1e-9
+_MIN_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 
 
 def nearest_axis(direction: Array) -> str:
     """Return the axis of S nearest to a direction (3,) in S; empty if none is near."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
-    if size < _MIN_OFFSET_M or abs(direction[k]) < _MIN_COS * size:
+    if size < _MIN_COM_OFFSET_M or abs(direction[k]) < _MIN_AXIS_COSINE * size:
         return ""
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 
 
 def last_joint_axis(arm: ArmModel) -> str:
-    """Return the axis of S along the last joint, away from it; empty if none is."""
+    """Return the axis of S that points away from the last joint along it; empty: none."""
     row = arm.table[arm.num_joints]
     along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
-    return nearest_axis(-along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_M else along)
+    return nearest_axis(-along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M else along)
 
 
 def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:
-    """Return model lines that make the tool axis z_S; empty if it is."""
+    """Return advice on a sensor frame with z along the tool; empty: not needed."""
     if axis == "z":
         return ""
     R_SA = TOOL_AXES[axis]

@@ -32,14 +32,14 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
-_PHANTOM_HALF_M = 0.08
+_PHANTOM_HALF_SIZE_M = 0.08
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
-_GOOD_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
+_SUFFICIENT_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
 _MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT_FORCE_N = 30.0
@@ -59,8 +59,8 @@ class Plan:
         own_tool: True if the model contains the tool.
         swing: amplitude of the slave in free motion [m].
         lowest: (3,) position in W of the tool's lowest point at the start [m].
-        tip: (3,) p_STip of this point [m]; empty along z_S.
-        axis_note: advice on unusual axes of the sensor frame.
+        tip: (3,) p_STip of this point [m]; empty for a tool along z_S.
+        axis_note: advice if the tool is not along z_S.
         overlaps: sentences about overlaps of shapes at the start.
         plane: height of the base plane [m].
         weak_joints: joints whose torque limits cannot hold the arm.
@@ -112,12 +112,12 @@ def plan_station(
     share = 1.0 if own_tool else MIN_LOAD_SHARE if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
-        on_sensor.mass = _mass_to_hold(model, place.q)
+        on_sensor.mass = _largest_mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
-    room = _PHANTOM_HALF_M if figures is None else min(figures.size) / 2.0
+    room = _PHANTOM_HALF_SIZE_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
-    translation_scale = _round_down(min(place.half / room, 1.0))
+    translation_scale = _floor_two_digits(min(place.half / room, 1.0))
     force_scale = min(
         peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
         _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS * translation_scale),
@@ -134,8 +134,8 @@ def plan_station(
         own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
-        force_scale=_round_down(force_scale),
-        swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
+        force_scale=_floor_two_digits(force_scale),
+        swing=_floor_two_digits(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
         lowest=lowest,
         tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
@@ -150,7 +150,7 @@ def plan_station(
 def _find_start(
     slave: Slave, shapes: PostureShapes, plane: float, natural: str
 ) -> tuple[Place, str, PostureShapes]:
-    """Return the start, the tool's axis of S, and the shapes; set a stand-in along that axis."""
+    # The start, the tool's axis of S, and the shapes; a stand-in tool is set along that axis.
     found: list[tuple[Place, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
@@ -158,20 +158,20 @@ def _find_start(
         if axis == OPPOSITE_AXIS[natural] and axis != "z":
             continue
         if is_stand_in:
-            slave.tool = _stand_in_tool(axis, _rod_length(shapes, axis))
+            slave.tool = _stand_in_tool(axis, _stand_in_length(shapes, axis))
             if axis != "z" or slave.tool.shapes[0].position[2] != _LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
             found.append((find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes))
         except DrakeTeleopError as error:
             errors.append(error)
-        if found and found[-1][0].score > _GOOD_SCORE:
+        if found and found[-1][0].score > _SUFFICIENT_SCORE:
             break
     if not found:
         raise errors[0]
     best = max(found, key=lambda each: each[0].score)
     if is_stand_in:
-        slave.tool = _stand_in_tool(best[1], _rod_length(best[2], best[1]))
+        slave.tool = _stand_in_tool(best[1], _stand_in_length(best[2], best[1]))
     return best
 
 
@@ -203,7 +203,7 @@ def _stand_in_tool(axis: str, length: float) -> Tool:
     return Tool(mass=_STAND_IN_MASSES_KG[0], com=(_COM_M * along).round(6).tolist(), shapes=[ball])
 
 
-def _rod_length(shapes: PostureShapes, axis: str) -> float:
+def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
     end = extent_beyond_sensor(shapes, shapes.sensor_bodies() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 
@@ -211,10 +211,10 @@ def _rod_length(shapes: PostureShapes, axis: str) -> float:
 def _without_weak_limits(
     arm: ArmModel, q: Array, share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
-    """Return the arm without limits that cannot hold it at q, these joints, and a text for each.
+    """Return the arm without torque limits too low to hold it at q, their joints, and texts.
 
     Args:
-        share: share of the load that the arm must hold; 0 for a tool of the user.
+        share: share of the load that the arm must hold.
     """
     torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
     weak = torque > MAX_TORQUE_USE * arm.effort_limit
@@ -226,7 +226,7 @@ def _without_weak_limits(
     return replace(arm, effort_limit=np.where(weak, np.inf, arm.effort_limit)), names, texts
 
 
-def _mass_to_hold(arm: ArmModel, q: Array) -> float:
+def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
@@ -242,6 +242,6 @@ def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
     return float((2.0 * np.pi * SWING_HZ * displacement / arm.velocity_limit).max())
 
 
-def _round_down(value: float) -> float:
+def _floor_two_digits(value: float) -> float:
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")

@@ -30,8 +30,8 @@ _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for 
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
 _SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 2.0
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
-_ROUNDING = 1e-9  # singular values that are 0, over the largest
-_NEUTRAL_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
+_ROUNDING_TOLERANCE = 1e-9  # singular values that are 0, over the largest
+_NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
 _GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
 
@@ -60,7 +60,7 @@ class Postures:
 
 @dataclass(frozen=True)
 class Region:
-    """Region of a start.
+    """Region in which a start is searched.
 
     Attributes:
         plane: height of the base plane [m].
@@ -186,7 +186,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
 
 
 def joint_margins(arm: ArmModel, q: Array) -> Array:
-    """Return the smallest distance (k,) to a limit over half the range; 1 without limits."""
+    """Return the least distance (k,) of joints to limits over half the range; 1 without limits."""
     limited = np.isfinite(arm.lower) & np.isfinite(arm.upper)
     lower, upper, inner = arm.lower[limited], arm.upper[limited], q[:, limited]
     shares = 2.0 * np.minimum(inner - lower, upper - inner) / (upper - lower)
@@ -195,7 +195,7 @@ def joint_margins(arm: ArmModel, q: Array) -> Array:
 
 
 def _singular_values(arm: ArmModel, postures: Postures) -> Array:
-    """Return the singular values (k, min(n, 6)) of the Jacobian, rotations times L [m]."""
+    # Rotations are multiplied by `orientation_length` [m].
     slides = (arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
     linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
@@ -208,7 +208,7 @@ def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _singular_values(arm, few)
-    return int((values > _ROUNDING * values[:, :1]).sum(axis=1).max())
+    return int((values > _ROUNDING_TOLERANCE * values[:, :1]).sum(axis=1).max())
 
 
 def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
@@ -232,11 +232,11 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
     farthest = sizes.argmax(axis=1)
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
-    return np.where(size > _NEUTRAL_OFFSET * reach, up, 1.0)
+    return np.where(size > _NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
 
 
 def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with the frame A instead of S."""
+    """Return the arm with its sensor frame rotated by R_SA, to z along the tool."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
     table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()

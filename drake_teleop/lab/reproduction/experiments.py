@@ -28,8 +28,8 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 Values = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_OVER_FREE = 1.5
-_ALL_AXES = Sine(
+_THRESHOLD_RATIO = 1.5
+_ALL_AXES_MOTION = Sine(
     duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
 )
 
@@ -38,7 +38,7 @@ _ALL_AXES = Sine(
 class FreeMotion:
     """Recorded free movement.
 
-    `scaled` contains the wrench (N, 6) at the slave by sigma, the share of the load's wrench in it.
+    `scaled`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
     """
 
     scenario: Scenario
@@ -48,7 +48,7 @@ class FreeMotion:
 
 @dataclass(frozen=True, eq=False)
 class IdealMotion:
-    """Free movement as Drake's plant moves, without any sensor.
+    """Free movement with exact wrench and motion instead of sensor readings.
 
     Attributes:
         reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
@@ -87,16 +87,16 @@ def simulate_free_motion(
     scenario: Scenario, estimate: Array, progress: UpdateProgress
 ) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
-    result = _simulate(scenario, estimate, progress)
+    result = _run_station(scenario, estimate, progress)
     scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
 def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
     """Simulate the contact transition with and without the leaf spring."""
-    touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
+    touched = _run_station(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
-    free = _simulate(without_leaf_spring(scenario), estimate, free_stage)
+    free = _run_station(without_leaf_spring(scenario), estimate, free_stage)
     calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
     return ContactMotion(
         scenario=scenario,
@@ -107,14 +107,14 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
         raw_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_free=calculated_free,
         contact=is_in_contact(touched),
-        threshold=_THRESHOLD_OVER_FREE * float(_force_norm(calculated_free).max()),
+        threshold=_THRESHOLD_RATIO * float(_force_norm(calculated_free).max()),
     )
 
 
 def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
     """Simulate a movement along and about all axes."""
     scenario = replace(
-        LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
+        LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES_MOTION], simulation__duration=0.4
     )
     rate, simulation = scenario.rates.log_hz, scenario.simulation
     phi = slave_arm(scenario).phi_load
@@ -143,7 +143,7 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the errors of the calculated load wrench."""
+    """Return peak wrenches and the errors of the calculated load wrench, by name."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
@@ -233,7 +233,7 @@ def without_leaf_spring(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
 
-def _simulate(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> SimulationResult:
+def _run_station(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     return simulate(station, scenario.simulation, progress=progress)
 

@@ -43,14 +43,14 @@ def scaling_figure(
             axes.plot(time, trace, color=BLUE if sigma else GREEN)
             axes.set_title(_sigma_title(sigma))
             peak = float(np.abs(trace).max())
-            _draw_note(
+            _write_note(
                 axes,
                 f"peak {_format_number(peak)} {unit}"
                 f"   ·   {_format_number(peak / downscaling)} {unit}"
                 " at the master",
             )
             axes.set_ylabel(f"{symbol} [{unit}]")
-            _master_axis(axes, downscaling, f"at the master [{unit}]")
+            _add_master_axis(axes, downscaling, f"at the master [{unit}]")
         rows[0].set_ylim(*_common_range(traces))
         rows[0].set_xlim(time[0], time[-1])
         rows[-1].set_xlabel(f"t [{time_unit}]")
@@ -92,8 +92,8 @@ def contact_figure(
         _mark_time(rows[1], detected_s * per_second, "detected", VERMILION)
         for level in (-threshold, threshold):
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
-        _draw_note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
-        _draw_note(
+        _write_note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
+        _write_note(
             rows[1],
             f"peak {_format_number(np.abs(traces[1]).max())} N"
             f"   ·   threshold {_format_number(threshold)} N",
@@ -127,11 +127,11 @@ def _format_number(value: float) -> str:
     return f"{rounded:.{decimals}f}"
 
 
-def _draw_note(axes: Axes, text: str) -> None:
+def _write_note(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
 
 
-def _master_axis(axes: Axes, downscaling: float, label: str) -> None:
+def _add_master_axis(axes: Axes, downscaling: float, label: str) -> None:
     right = axes.secondary_yaxis(
         "right",
         functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),

@@ -17,7 +17,7 @@ from drake_teleop.common.files import write_text
 from drake_teleop.common.html import png_data_url, render_page
 
 # Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
-_PARAMETERS = (
+_PARAMETER_FORMATS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
     ("m", "", "kg", 1.0),
@@ -28,9 +28,9 @@ _PARAMETERS = (
 
 _NOT_REPORTED = "not reported"
 # Pairs of verdicts: for an accepted value, for an unaccepted value.
-_VERDICTS_OF_SET = ("as set", "not as set")
-_WITHIN_BOUND = ("within our bound", "beyond our bound")
-_VERDICTS_OF_FOUND = ("agrees", "differs")
+_VERDICTS_OF_SET_VALUES = ("as set", "not as set")
+_VERDICTS_OF_OUR_BOUND = ("within our bound", "beyond our bound")
+_VERDICTS_OF_FOUND_VALUES = ("agrees", "differs")
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class Comparison:
     def verdict(self) -> str:
         if self.holds is None:
             return "for the record"
-        words = _VERDICTS_OF_SET if self.origin == "set" else _VERDICTS_OF_FOUND
+        words = _VERDICTS_OF_SET_VALUES if self.origin == "set" else _VERDICTS_OF_FOUND_VALUES
         if self.paper == _NOT_REPORTED:
-            words = _WITHIN_BOUND
+            words = _VERDICTS_OF_OUR_BOUND
         return words[0] if self.holds else words[1]
 
     @property
-    def pill(self) -> str:
+    def css_class(self) -> str:
         """CSS class of the verdict: "agrees", "differs" (highlighted) or "" (neutral)."""
         if self.holds is False:
             return "differs"
@@ -131,7 +131,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the rows outside the accepted range as text."""
+    """Return a text for each value outside its accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
@@ -185,7 +185,7 @@ def parameter_rows(
     """Return the rows of the identification table from offsets and phi (16,), SI."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
-    for (symbol, index, unit, scale), values in zip(_PARAMETERS, columns, strict=True):
+    for (symbol, index, unit, scale), values in zip(_PARAMETER_FORMATS, columns, strict=True):
         truth, found, sigma = scale * values
         # Two digits of the uncertainty determine the decimals of the value.
         decimals = 3 if sigma <= 0 else int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))

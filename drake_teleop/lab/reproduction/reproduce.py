@@ -54,7 +54,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 
 # Slow motion of the replay; the contact lasts 40 ms.
-_SLOW_MOTION = 8.0
+_SLOW_FACTOR = 8.0
 _FORCE_Z, _TORQUE_X = 2, 3
 
 
@@ -100,7 +100,7 @@ def reproduce_command(
             write_json(out / "summary.json", summary)
         written(1.0)
     if not quiet:
-        _print(compare_with_paper(values_by_full_name(summary)), out)
+        _print_comparison(compare_with_paper(values_by_full_name(summary)), out)
     return summary | session
 
 
@@ -173,9 +173,9 @@ def _write_results(
     load.identification.save(out / "identification.json")
     for name, picture in pictures.items():
         write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
-    write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_MOTION)
+    write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_FACTOR)
     figures = values_by_full_name(summary)
-    write_text(out / "table.md", _markdown(compare_with_paper(figures)))
+    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
     write_report(
         out / "report.html",
         setup=_describe_setup(seed, force.scenario, load),
@@ -218,7 +218,7 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
     }
 
 
-def _markdown(rows: list[Comparison]) -> str:
+def _markdown_table(rows: list[Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
         f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
@@ -228,7 +228,7 @@ def _markdown(rows: list[Comparison]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _print(rows: list[Comparison], out: Path) -> None:
+def _print_comparison(rows: list[Comparison], out: Path) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -241,7 +241,7 @@ def _print(rows: list[Comparison], out: Path) -> None:
     table.add_column("Verdict", no_wrap=True)
     colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
-        verdict = f"[{colours[row.pill]}]{row.verdict}[/]"
+        verdict = f"[{colours[row.css_class]}]{row.verdict}[/]"
         table.add_row(row.what, row.paper, row.ours, row.origin, verdict)
     console = Console()
     console.print(table)

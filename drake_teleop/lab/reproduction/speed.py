@@ -15,7 +15,7 @@ from drake_teleop.station.simulation import MakeSimulator, advance_without_garba
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_RUN_S = 0.1  # simulated time of one measurement [s]
+_MEASURED_TIME_S = 0.1  # simulated time of one measurement [s]
 
 
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
@@ -60,8 +60,8 @@ def cpu_seconds(
         for name, simulator in simulators.items():
             start = time.thread_time()
             advance_without_garbage_collection(
-                simulator, simulator.get_context().get_time() + _RUN_S
+                simulator, simulator.get_context().get_time() + _MEASURED_TIME_S
             )
-            times_s[name].append((time.thread_time() - start) / _RUN_S)
+            times_s[name].append((time.thread_time() - start) / _MEASURED_TIME_S)
         progress((k + 1) / repetitions)
     return {name: min(times) for name, times in times_s.items()}

@@ -34,9 +34,9 @@ def propose_points(places: Array, objective: ArrayLike, candidates: Array, count
     places, candidates = places / lengths, candidates / lengths
     chosen: list[int] = []
     for _ in range(count):
-        mean, deviation = _predict(places, y, candidates, noise)
+        mean, deviation = _predict_points(places, y, candidates, noise)
         # Improvement over the best predicted mean, not over the best noisy value.
-        best = _predict(places, y, places, noise)[0].min()
+        best = _predict_points(places, y, places, noise)[0].min()
         u = (best - mean) / deviation
         improvement = deviation * (u * ndtr(u) + norm.pdf(u))
         improvement[chosen] = -1.0
@@ -48,7 +48,7 @@ def propose_points(places: Array, objective: ArrayLike, candidates: Array, count
 
 def _fit_kernel(places: Array, y: Array) -> tuple[Array, float]:
     def misfit(x: Array) -> float:
-        K = _kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
+        K = _matern_kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])
         factor = cho_factor(K, lower=True)
         logarithm = np.log(np.diag(factor[0])).sum()
@@ -61,17 +61,17 @@ def _fit_kernel(places: Array, y: Array) -> tuple[Array, float]:
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 
 
-def _predict(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
-    K = _kernel(places, places)
+def _predict_points(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
+    K = _matern_kernel(places, places)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)
-    cross = _kernel(places, queries)
+    cross = _matern_kernel(places, queries)
     mean = cross.T @ cho_solve((lower, True), y)
     explained = np.sum(solve_triangular(lower, cross, lower=True) ** 2, axis=0)
     return mean, np.sqrt(np.maximum(1.0 - explained, 1e-12))
 
 
-def _kernel(a: Array, b: Array) -> Array:
+def _matern_kernel(a: Array, b: Array) -> Array:
     r = np.sqrt(5.0 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
     kernel: Array = (1.0 + r + r * r / 3.0) * np.exp(-r)
     return kernel

@@ -40,8 +40,8 @@ class Factor:
     high: float | None = plain(None, "end of the range")
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
-    def listed_values(self) -> Sequence[Value]:
-        """Return the list, or `levels` numbers of the range."""
+    def level_values(self) -> Sequence[Value]:
+        """Return the listed values, or `levels` numbers of the range."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
@@ -50,17 +50,17 @@ class Factor:
         """Return the value at a share (0 to 1) of the range or the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
-        listed = self.listed_values()
+        listed = self.level_values()
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
-        """Return a number, or one indicator (0 or 1) per listed value of a word, flag or vector."""
+        """Return a number from 0 to 1, or an indicator (0 or 1) for each word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
             low, high = min(self.values), max(self.values)
         else:
-            return [float(value == other) for other in self.listed_values()]
+            return [float(value == other) for other in self.level_values()]
         assert isinstance(value, (int, float))
         return [(value - low) / (high - low) if high > low else 0.0]
 
@@ -69,7 +69,7 @@ class Factor:
         lists = (self.values, self.words, self.flags, self.vectors)
         if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
             raise DrakeTeleopError(
-                "its values are ambiguous or missing",
+                "has no values, or several kinds of them",
                 where=where,
                 remedy="give one of values, words, flags, vectors, or both low and high",
             )
@@ -77,7 +77,7 @@ class Factor:
         numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
         if not all(map(math.isfinite, numbers)):
             raise DrakeTeleopError(
-                "its numbers, or their range, are not finite",
+                "has numbers, or a range, that are not finite",
                 where=where,
                 remedy="replace NaN and infinity",
             )
@@ -87,10 +87,10 @@ class Factor:
                 where=f"{where}.high",
                 remedy="raise high or lower low",
             )
-        listed = self.listed_values()
-        if any(value in listed[:index] for index, value in enumerate(listed)):
+        listed = self.level_values()
+        if repeated := [value for k, value in enumerate(listed) if value in listed[:k]]:
             raise DrakeTeleopError(
-                "a value is repeated", where=where, remedy="list each value once"
+                f"repeats the value {repeated[0]}", where=where, remedy="list each value once"
             )
 
 
@@ -144,11 +144,13 @@ class Study:
                 )
         if not self.factors:
             raise DrakeTeleopError(
-                "there are no factors", where=f"{where}:factors", remedy="add at least one"
+                "is empty (a study varies at least one field)",
+                where=f"{where}:factors",
+                remedy="add a factor",
             )
         if self.design == "sobol" and self.samples & (self.samples - 1):
             raise DrakeTeleopError(
-                f"{self.samples} Sobol points are not balanced",
+                f"{self.samples} Sobol points are not balanced (a power of two is)",
                 where=f"{where}:samples",
                 remedy="give a power of two",
             )
@@ -161,7 +163,7 @@ class Study:
 
     def size(self) -> int:
         if self.design == "factorial":
-            return math.prod(len(factor.listed_values()) for factor in self.factors)
+            return math.prod(len(factor.level_values()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
@@ -169,25 +171,25 @@ class Study:
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
-            remedy = f"give fewer values or repeats: a study has {MAX_RUNS:,} runs at most"
-            raise DrakeTeleopError(f"{what} are too many", where=where, remedy=remedy)
+            what = f"{what} are too many (at most {MAX_RUNS:,})"
+            raise DrakeTeleopError(what, where=where, remedy="give fewer values or repeats")
         if runs <= MANY_RUNS or yes is True:
             return
         if yes is False or not yes(f"{where}: {what}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
-            raise DrakeTeleopError(f"{what} need a confirmation", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"{what} need your consent", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
         """Return all points (field -> value); of an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
-            combinations = itertools.product(*(factor.listed_values() for factor in self.factors))
+            combinations = itertools.product(*(factor.level_values() for factor in self.factors))
             return [dict(zip(names, values, strict=True)) for values in combinations]
         if self.design == "sobol":
-            return self._sobol(self.samples, self.seed)
+            return self._draw_sobol_points(self.samples, self.seed)
         # At least two points for each factor.
         first = max(self.batch, 2 * (len(self.factors) + 1))
-        return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
+        return self._draw_sobol_points(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
         """Return the next points of an adaptive design; an empty list at its end."""
@@ -198,7 +200,7 @@ class Study:
 
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
-        drawn = self._sobol(_NUM_CANDIDATES, self.seed + len(points))
+        drawn = self._draw_sobol_points(_NUM_CANDIDATES, self.seed + len(points))
         candidates = list(
             {str(point): point for point in drawn if str(point) not in tried}.values()
         )
@@ -210,14 +212,14 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return one table row without measures for each run."""
+        """Return a table row (run, point, seed, values) without measures for each run."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values
             for run, ((point, values), repeat) in enumerate(order, first * self.repeats)
         ]
 
-    def _sobol(self, count: int, seed: int) -> list[Values]:
+    def _draw_sobol_points(self, count: int, seed: int) -> list[Values]:
         from scipy.stats import qmc
 
         # All SciPy versions accept a generator as `seed`.

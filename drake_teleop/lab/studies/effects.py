@@ -18,13 +18,13 @@ from scipy.special import stdtrit
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.level_model import (
-    CONFIDENCE,
-    TOO_FEW,
-    Flags,
+    CONFIDENCE_LEVEL,
+    TOO_FEW_POINTS,
+    BooleanArray,
     LevelModel,
+    assign_levels,
+    fit_level_model,
     largest_complete_block,
-    level_model,
-    levels_of,
     missing_value_reasons,
 )
 
@@ -44,12 +44,13 @@ class Factorial:
 
     levels: list[NDArray[np.int64]]
     counts: list[int]
-    seen: Flags
+    seen: BooleanArray
 
-    def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return booleans of comparable levels (or cells of two factors) and of used combinations.
+    def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
+        """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
 
-        The matrix (kept rows, n) maps point values to means.
+        For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
+        of points to means over the used combinations of the other factors' levels.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -98,7 +99,7 @@ class Factorial:
         spread -= weights**2 @ ((runs - 1) / (seeds * (seeds - 1)))
         residuals = table - table.mean(axis=1, keepdims=True) - table.mean(axis=0) + table.mean()
         variance = np.sum(residuals**2) / freedom
-        quantile = stdtrit(freedom, 0.5 + CONFIDENCE / 2)
+        quantile = stdtrit(freedom, 0.5 + CONFIDENCE_LEVEL / 2)
         return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
 
 
@@ -120,13 +121,13 @@ def seed_interval(table: Array) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.nansum(table, axis=1) / count
         spread = np.nansum((table - mean[:, None]) ** 2, axis=1) / (count - 1)
-        quantile = stdtrit(np.maximum(count - 1, 1), 0.5 + CONFIDENCE / 2)
+        quantile = stdtrit(np.maximum(count - 1, 1), 0.5 + CONFIDENCE_LEVEL / 2)
         half = quantile * np.sqrt(spread / count)
     return mean, np.where(count > 1, half, np.nan)
 
 
 #: Measures of the Pareto front.
-PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
+PARETO_MEASURES = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,7 @@ class PairMeans:
 def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at `count` levels; nan is ignored."""
+    """Return the means over seeds of values (N,) at `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -256,7 +257,7 @@ class _MeasureData:
         used = np.ix_(known, seen.any(axis=0))
         self.table = fill_missing(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
-        self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
+        self.levels = [assign_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
@@ -264,14 +265,14 @@ class _MeasureData:
             self.model = Factorial(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
-            self.model = level_model(self.factors, columns, known, by_chance=by_chance)
+            self.model = fit_level_model(self.factors, columns, known, by_chance=by_chance)
             self.levels = self.levels if self.model is None else self.model.factors
 
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
         count = len(levels.names)
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
-        why, compared = [TOO_FEW] * count, 0
+        why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
             is_compared, combinations, weights = self.model.comparable_levels(factor)
             if is_compared.sum() > 1:
@@ -314,7 +315,7 @@ class _MeasureData:
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(combinations) * math.prod(others))
 
-    def _missing_value_reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
+    def _missing_value_reasons(self, compared: BooleanArray, cell: NDArray[np.int64]) -> list[str]:
         runs = np.bincount(cell, minlength=len(compared))
         return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
@@ -329,17 +330,17 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of `PARETO`; None if one is missing."""
+    """Return all points with their means of `PARETO_MEASURES`; None if one is missing."""
     import polars as pl
 
-    if not set(PARETO) <= set(study.measures) or rows.is_empty():
+    if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():
         return None
     fields = [factor.field for factor in study.factors]
     points = rows.unique("point", keep="first").sort("point").select("point", *fields)
     order, index = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, complete = rows["seed"].to_numpy(), np.ones(len(order), dtype=bool)
     means = []
-    for name in PARETO:
+    for name in PARETO_MEASURES:
         values = measure_values(rows, name)
         complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
         found = estimate_means(values, index, seeds, len(order))
@@ -354,7 +355,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return complete points that no other dominates; columns are minimised."""
+    """Return whether each point is complete and not dominated; columns are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -364,7 +365,7 @@ def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np
 
 
 def varied_factors(study: Study) -> list[Factor]:
-    return [factor for factor in study.factors if len(factor.listed_values()) > 1]
+    return [factor for factor in study.factors if len(factor.level_values()) > 1]
 
 
 def measure_values(rows: pl.DataFrame, measure: str) -> Array:

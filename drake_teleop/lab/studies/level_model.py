@@ -18,35 +18,35 @@ from scipy.special import stdtrit
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.design import Factor, Value
 
-Flags: TypeAlias = NDArray[np.bool_]
+BooleanArray: TypeAlias = NDArray[np.bool_]
 
 #: Reasons for a level or cell without value.
 NO_RUN, NO_SUCCESS = "no run", "no successful run"
 NOT_COMPARABLE = "not comparable with the others"
-TOO_FEW = "too few points"
+TOO_FEW_POINTS = "too few points"
 
 
-def largest_complete_block(there: Flags) -> tuple[Flags, Flags]:
-    """Return rows and columns of the largest complete block.
+def largest_complete_block(there: BooleanArray) -> tuple[BooleanArray, BooleanArray]:
+    """Return rows and columns of the largest block without missing values.
 
     `there` is True where a level (row) has a value at a combination (column).
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
     rows = patterns[:, np.argmax(times)]
-    columns: Flags = np.logical_and.reduce(there[rows], axis=0)
+    columns: BooleanArray = np.logical_and.reduce(there[rows], axis=0)
     return rows, columns
 
 
 def missing_value_reasons(
-    compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]
+    compared: BooleanArray, runs: NDArray[np.int64], good: NDArray[np.int64]
 ) -> list[str]:
     """Return for each level or cell why it has no value; "" where `compared` is True."""
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
 
-CONFIDENCE = 0.95
+CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
 _MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
@@ -74,9 +74,9 @@ class Levels:
     middles: Array
 
 
-def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
+def assign_levels(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
-    listed = factor.listed_values()
+    listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
         share = places[:, 0]
@@ -110,12 +110,12 @@ class LevelModel:
     factors: list[Levels]
     codes: list[Array]
     products: dict[tuple[int, int], slice]
-    failed: dict[tuple[int, int], Flags]
+    failed: dict[tuple[int, int], BooleanArray]
     X: Array
     solve: Array
 
-    def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the same as in `Factorial`, with a matrix from coefficients to means."""
+    def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
+        """Return the same as `Factorial`, but with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
         shape = [len(self.factors[factor].names) for factor in factors]
@@ -129,7 +129,7 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return per factor the effects and half widths, which hold together (Bonferroni)."""
+        """Return the effects of each factor and half widths of joint intervals (Bonferroni)."""
         means = [self.comparable_levels(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
@@ -203,21 +203,21 @@ class LevelModel:
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
 
 
-def level_model(
+def fit_level_model(
     factors: Sequence[Factor],
     columns: Sequence[Sequence[Value]],
-    known: Flags | None = None,
+    known: BooleanArray | None = None,
     *,
     by_chance: bool = True,
 ) -> LevelModel | None:
-    """Return a regression model that the points determine, or None.
+    """Return the finest regression model that the points determine, or None.
 
     `known` (n,): the measure has a value; `by_chance`: combinations without points are missing by
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:
-        levels = [levels_of(f, c, parts) for f, c in zip(factors, columns, strict=True)]
+        levels = [assign_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model
@@ -227,7 +227,7 @@ def level_model(
 
 
 def _build_model(
-    factors: list[Levels], products: bool, known: Flags, by_chance: bool
+    factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
     failed = _failed_cells(factors, known, by_chance)
@@ -252,8 +252,8 @@ def _build_model(
 
 
 def _failed_cells(
-    factors: list[Levels], known: Flags, by_chance: bool
-) -> dict[tuple[int, int], Flags]:
+    factors: list[Levels], known: BooleanArray, by_chance: bool
+) -> dict[tuple[int, int], BooleanArray]:
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
@@ -281,7 +281,7 @@ def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
 
 
 def _student_quantile(together: int, freedom: int) -> float:
-    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
+    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / together))
 
 
 def _format_value(value: Value) -> str:

@@ -34,7 +34,7 @@ def _hand_work(result: SimulationResult, threshold: float) -> float:
     return float(np.trapezoid(power, result.t))
 
 
-def _time_above(result: SimulationResult, threshold: float) -> float:
+def _time_above_threshold(result: SimulationResult, threshold: float) -> float:
     above = np.linalg.norm(_force_to_master(result), axis=1) > threshold
     return float(np.trapezoid(above.astype(float), result.t))
 
@@ -51,7 +51,7 @@ _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = 
     # Work of the hand on the stylus: integral of F.v + tau.omega.
     "hand_work_J": _hand_work,
     # Time of a displayed force above the threshold.
-    "time_above_force_s": _time_above,
+    "time_above_force_s": _time_above_threshold,
 }
 
 

@@ -17,27 +17,27 @@ from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
 from drake_teleop.lab.studies.effects import (
-    PARETO,
+    PARETO_MEASURES,
     measure_values,
     pair_means,
     pareto_table,
     varied_factors,
 )
 from drake_teleop.lab.studies.level_model import (
-    CONFIDENCE,
+    CONFIDENCE_LEVEL,
     NO_RUN,
     NO_SUCCESS,
     NOT_COMPARABLE,
-    TOO_FEW,
+    TOO_FEW_POINTS,
 )
 
 if TYPE_CHECKING:
     import polars as pl
 
 _MAX_LABELS = 24  # largest number of labelled points
-_MAX_LETTERS = 24  # letters that fit below a picture
+_MAX_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
-_HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
+_HATCH_OF_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
@@ -91,7 +91,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
-        words = TOO_FEW if TOO_FEW in found.why else ""
+        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.why else ""
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
@@ -100,7 +100,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
 
 def _label_levels(axes: Axes, levels: list[str]) -> None:
     axes.set_xticks(range(len(levels)), levels)
-    if len("".join(levels)) > _MAX_LETTERS:
+    if len("".join(levels)) > _MAX_LABEL_LETTERS:
         for label in axes.get_xticklabels():
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
@@ -112,11 +112,11 @@ def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str
 
 
 def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
-    return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
+    return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_OF_REASON[why], fc="white", ec=GREY, lw=0)
 
 
 def _draw_reason_legend(figure: Figure, reasons: Iterable[str]) -> None:
-    names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
+    names = [why for why in _HATCH_OF_REASON if why in reasons and why != TOO_FEW_POINTS]
     if names:
         patches = [_hatched_cell(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
@@ -161,15 +161,15 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     factors = [factor.field for factor in varied_factors(study)]
     with plot_style():
         figure = Picture(figsize=(10.0, 4.2))
-        for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):
-            axes.plot(points[name], points[PARETO[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _draw_bars(axes, on_front, name)
+        for axes, name in zip(figure.subplots(1, 2), PARETO_MEASURES[1:], strict=True):
+            axes.plot(points[name], points[PARETO_MEASURES[0]], "o", ms=3, color=GREY, alpha=0.5)
+            _draw_pareto_bars(axes, on_front, name)
             axes.set_xlabel(name)
-            axes.set_ylabel(PARETO[0])
+            axes.set_ylabel(PARETO_MEASURES[0])
         if on_front.height <= _MAX_LABELS:
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
-                for axes, name in zip(figure.axes, PARETO[1:], strict=True):
-                    axes.annotate(str(place), (point[name], point[PARETO[0]]), (4, 4),
+                for axes, name in zip(figure.axes, PARETO_MEASURES[1:], strict=True):
+                    axes.annotate(str(place), (point[name], point[PARETO_MEASURES[0]]), (4, 4),
                                   textcoords="offset points", fontsize=8)  # fmt: skip
             lines = [
                 f"{place}: "
@@ -179,28 +179,28 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
             figure.text(1.0, 0.5, "\n".join(lines), fontsize=7.5, va="center")
         left = rows["point"].n_unique() - points.height
         words = f"; points left out for failures: {left}" if left else ""
-        title = f"Pareto front of all three (red){_caption(study, 'of the mean')}{words}"
+        title = f"Pareto front of all three (red){_interval_caption(study, 'of the mean')}{words}"
         figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
-def _draw_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
-    half = [np.nan_to_num(points[f"{which}_half"].to_numpy()) for which in (name, PARETO[0])]
+def _draw_pareto_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+    half = [np.nan_to_num(points[f"{key}_half"].to_numpy()) for key in (name, PARETO_MEASURES[0])]
     axes.errorbar(
-        points[name], points[PARETO[0]], half[1], half[0],
+        points[name], points[PARETO_MEASURES[0]], half[1], half[0],
         color=VERMILION, marker="o", ms=4, lw=0, elinewidth=0.9, capsize=2,
     )  # fmt: skip
 
 
 def _effects_caption(study: Study, fitted: bool) -> str:
     if not fitted:
-        return _caption(study, "of a level against the mean (dotted)")
-    words = f"; bars: {CONFIDENCE:.0%} intervals of all levels against the mean (dotted)"
+        return _interval_caption(study, "of a level against the mean (dotted)")
+    words = f"; bars: {CONFIDENCE_LEVEL:.0%} intervals of all levels against the mean (dotted)"
     over = "one seed" if study.repeats == 1 else f"{study.repeats} seeds"
     return f"{words}, over the design and {over}"
 
 
-def _caption(study: Study, what: str) -> str:
+def _interval_caption(study: Study, what: str) -> str:
     if study.repeats == 1:
         return "; one repeat has no intervals"
-    return f"; bars: {CONFIDENCE:.0%} intervals {what}, over {study.repeats} seeds"
+    return f"; bars: {CONFIDENCE_LEVEL:.0%} intervals {what}, over {study.repeats} seeds"

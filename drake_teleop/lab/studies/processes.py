@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run ends its process, its chunk runs row by row; a row that ends it again gets an error. With
-one job, this ends the study.
+If a run crashes its process, the runs of its chunk are repeated one by one; a run that crashes
+again gets an error. With one job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from drake_teleop.lab.studies.store import Store
 
 Chunk: TypeAlias = list[dict[str, Any]]
 """Rows that one process runs together."""
-Run: TypeAlias = Callable[[Chunk], Chunk]
+RunRows: TypeAlias = Callable[[Chunk], Chunk]
 
 
 @dataclass(frozen=True)
 class RunExecutor:
-    """Executor of runs; `rows_of` yields finished chunks (groups of rows) with results."""
+    """Executor of `count` runs at once; `rows_of` yields finished chunks (groups of rows)."""
 
     count: int
-    rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
+    rows_of: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 
 
-PROCESS_ENDED = "the run has ended its process"
+PROCESS_ENDED_ERROR = "the run has ended its process"
 _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 
@@ -48,7 +48,7 @@ def open_executor(
     if executor is not None:
         if not isinstance(executor, Executor):
             raise DrakeTeleopError(
-                f"{type(executor).__name__} is not a concurrent.futures.Executor",
+                f"has type {type(executor).__name__}, not concurrent.futures.Executor",
                 where="executor",
                 remedy="pass a ProcessPoolExecutor, for instance",
             )
@@ -70,7 +70,7 @@ def open_executor(
         yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
@@ -78,7 +78,7 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
         marked = store.chunks_started_at_least(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
-                yield _run_alone(run, chunk, store)
+                yield _run_rows_alone(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
@@ -89,7 +89,9 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
             suspicious = 1
             if not store.chunks_started_at_least(suspicious):
                 raise DrakeTeleopError(
-                    f"processes ended before their first run ({error})"
+                    f"processes ended before their first run ({error})",
+                    where="study",
+                    remedy="repeat with one job to see the cause",
                 ) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
@@ -110,25 +112,25 @@ def _joblib_pool(jobs: int) -> Any:
     )
 
 
-def _delayed_task(run: Run, chunk: Chunk, store: Store) -> Any:
+def _delayed_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
     return delayed(_run_and_count_start)(run, chunk, store)
 
 
-def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
+def _run_rows_alone(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     found = []
     for row in chunk:
         try:
             # With one job joblib would run it in this process.
             found += next(_joblib_pool(2)([_delayed_task(run, [row], store)]))
         except BrokenExecutor:
-            found.append(row | {"error": PROCESS_ENDED})
+            found.append(row | {"error": PROCESS_ENDED_ERROR})
     store.clear_starts(chunk[0]["run"])
     return found
 
 
-def _run_and_count_start(run: Run, chunk: Chunk, store: Store) -> Chunk:
+def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     store.count_start(chunk[0]["run"])
     try:
         return run(chunk)
@@ -178,14 +180,14 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _run_by_executor(run: Run, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
+def _run_by_executor(run: RunRows, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
     futures = [executor.submit(run, chunk) for chunk in chunks]
     try:
         for future in as_completed(futures):
             yield future.result()
     except BrokenExecutor as error:
         raise DrakeTeleopError(
-            f"ended before the study ({error})",
+            f"ended before all runs were finished ({error})",
             where="executor",
             remedy="repeat the call with a new executor; finished runs are kept",
         ) from error
@@ -218,8 +220,8 @@ def _version_error(worker: str, found: Any, expected: str) -> DrakeTeleopError:
     )
 
 
-def _check_version_before_run(run: Run) -> Run:
-    """Return `run` with a check of the version, for workers that join later."""
+def _check_version_before_run(run: RunRows) -> RunRows:
+    # For workers that join later.
     version, expected = _make_version_reader(), __version__
 
     def run_on_same_version(chunk: Chunk) -> Chunk:
@@ -232,7 +234,7 @@ def _check_version_before_run(run: Run) -> Run:
     return run_on_same_version
 
 
-def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
+def _run_on_cluster(run: RunRows, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
     run = _check_version_before_run(run)
@@ -242,14 +244,14 @@ def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[
         yield _rows_of_future(future, chunk_of.pop(future), run, client)
 
 
-def _rows_of_future(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
+def _rows_of_future(future: Any, chunk: Chunk, run: RunRows, client: Any) -> Chunk:
     from distributed import KilledWorker
 
     try:
         found: Chunk = future.result()
     except KilledWorker:
         if len(chunk) == 1:
-            return [chunk[0] | {"error": PROCESS_ENDED}]
+            return [chunk[0] | {"error": PROCESS_ENDED_ERROR}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
         found = [row for part, rows in alone for row in _rows_of_future(part, rows, run, client)]
     return found

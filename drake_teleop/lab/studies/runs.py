@@ -33,11 +33,11 @@ Work: TypeAlias = Callable[[Values, int], dict[str, float]]
 
 ONE_TIME_COST = "seconds_once"
 """Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
-_SECONDS = "seconds"
+_RUN_TIME_KEY = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
-_LARGEST_CHUNK = 8
+_MAX_RUNS_PER_CHUNK = 8
 _NUM_CHUNKS = 512
 _NUM_SINGLE_RUNS = 64
 # Number of latest runs for the estimate of the remaining time.
@@ -66,6 +66,7 @@ def run_study(
     if (part or merge) and study.design == "adaptive":
         raise DrakeTeleopError(
             "an adaptive design has no shards, because its points depend on earlier runs",
+            where="study",
             remedy="use jobs, cluster or executor",
         )
     points = study.points()
@@ -111,7 +112,7 @@ def run_study(
 
 
 def _group_into_chunks(rows: Chunk) -> list[Chunk]:
-    size = min(max(len(rows) // _NUM_CHUNKS, 1), _LARGEST_CHUNK)
+    size = min(max(len(rows) // _NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
     chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
     chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     return chunks
@@ -140,19 +141,19 @@ class StudyProgress:
 
     def add_earlier_runs(self, runs: int) -> None:
         self.done += runs
-        self._report()
+        self._report_progress()
 
     def add_finished_runs(self, rows: Chunk) -> None:
         """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
-            if _SECONDS in row:  # missing if the run ended its process
+            if _RUN_TIME_KEY in row:  # missing if the run ended its process
                 first = self._num_timed < _NUM_RECENT_RUNS
-                self._recent.append(row[_SECONDS] - (row.get(ONE_TIME_COST, 0.0) if first else 0.0))
+                self._recent.append(row[_RUN_TIME_KEY] - first * row.get(ONE_TIME_COST, 0.0))
                 self._num_timed += 1
-        self._report()
+        self._report_progress()
 
-    def _report(self) -> None:
+    def _report_progress(self) -> None:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
@@ -182,7 +183,7 @@ def _run_chunk(
             except Exception as error:  # other runs must continue
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
             # Not stored in the table, which must be reproducible.
-            found.append(row | measures | {_SECONDS: time.monotonic() - start})
+            found.append(row | measures | {_RUN_TIME_KEY: time.monotonic() - start})
     return found
 
 

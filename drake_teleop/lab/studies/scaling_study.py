@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
-SELECTIONS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
-_OBJECT_STUDY = "scaling_object"
+_OBJECT_STUDY_NAME = "scaling_object"
 _SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_DRAWS, _SEED = 2000, 0
 _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
@@ -72,10 +72,10 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run the remaining runs of the scaling studies; write results; return those of answer.json."""
+    """Run the missing runs of the scaling studies; write results; return answer.json's content."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):
+    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY_NAME):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
@@ -84,14 +84,14 @@ def scaling_study_command(
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _scale_axes()
     answers = {
-        selection: rate_scales(tables, criteria) for selection, criteria in SELECTIONS.items()
+        selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
     }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
             selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
         },
-        "eta": _eta_effects(rows[_OBJECT_STUDY]),
+        "eta": _eta_effects(rows[_OBJECT_STUDY_NAME]),
     }
     with output_folder(out, "answer.json"):
         write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
@@ -99,7 +99,7 @@ def scaling_study_command(
         write_picture(out / "choice.png", draw_best_scales(answers, sigmas, gammas))
         write_json(out / "answer.json", summary)
     if not quiet:
-        _print(summary, out)
+        _print_best_scales(summary, out)
     return summary
 
 
@@ -291,7 +291,7 @@ def _cell_text(found: ScaleRating, i: int, j: int) -> str:
     return f"{found.merit[i, j]:.2f}{best}"
 
 
-def _print(summary: dict[str, Any], out: Path) -> None:
+def _print_best_scales(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

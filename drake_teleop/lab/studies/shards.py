@@ -17,12 +17,12 @@ from drake_teleop.common.files import whole_file
 from drake_teleop.lab.studies.processes import Chunk
 from drake_teleop.lab.studies.store import Store, check_identity
 
-_FOLDER = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
+_SHARD_FOLDER_PATTERN = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
 _MAX_LISTED_SHARDS = 20
 
 
 class Shard(NamedTuple):
-    """Shard `number` (from 1) of `total`."""
+    """One of `total` shards of a study, with its `number` from 1."""
 
     number: int
     total: int
@@ -33,7 +33,7 @@ class Shard(NamedTuple):
     def chunks(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         if self.total > len(chunks):
             raise DrakeTeleopError(
-                f"the study has only {len(chunks)} groups of runs",
+                f"the study has only {len(chunks)} chunks of runs (one for each shard)",
                 where=f"shard {self.number}/{self.total}",
                 remedy=f"give at most {len(chunks)} shards",
             )
@@ -51,16 +51,16 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Link the parts of all shards in `out` into its table."""
-    names = [_FOLDER.fullmatch(path.name) for path in (out / "shards").glob("*")]
+    """Add the result files of all shards in `out` to its table, by hard links."""
+    names = [_SHARD_FOLDER_PATTERN.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:
         raise DrakeTeleopError("has no shards", where=str(out), remedy="run study --shard K/N")
     for shard in sorted(shards):
         folder = shard.folder(out)
         check_identity(folder, identity)
-        for part in Store(folder / "runs.parquet").parts():
-            _link_file(part, store.folder / part.name, store.folder)
+        for part in Store(folder / "runs.parquet").part_files():
+            _link_or_copy_file(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()
     finished = store.finished_chunks()
     missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
@@ -77,7 +77,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         )
 
 
-def _link_file(part: Path, path: Path, aside: Path) -> None:
+def _link_or_copy_file(part: Path, path: Path, aside: Path) -> None:
     if path.exists():
         return
     with whole_file(path, aside=aside) as temporary:

@@ -21,7 +21,7 @@ from drake_teleop.common.parquet_sizes import check_parquet
 if TYPE_CHECKING:
     import polars as pl
 
-_PART = "run_{:08d}.parquet"
+_PART_FILE_NAME = "run_{:08d}.parquet"
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,21 @@ class Store:
 
     def finished_chunks(self) -> set[int]:
         """Return the first run of each stored chunk."""
-        return set(map(_first_run, self.parts()))
+        return set(map(_first_run, self.part_files()))
 
-    def parts(self) -> list[Path]:
+    def part_files(self) -> list[Path]:
         """Return the files of the stored chunks, sorted by run."""
-        return sorted(self.folder.glob(_PART.format(0).replace("0", "[0-9]")))
+        return sorted(self.folder.glob(_PART_FILE_NAME.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
-        parts = self.parts()
-        whole = _runs_in(parts)
+        parts = self.part_files()
+        whole = _read_runs(parts)
         for part in parts:
-            if not {_first_run(part)} & (whole or _runs_in([part])):
+            if not {_first_run(part)} & (whole or _read_runs([part])):
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
+        write_table(self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, aside=self.folder)
 
     def count_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""
@@ -73,7 +73,7 @@ class Store:
         import polars as pl
 
         remedy = "remove the damaged part and repeat the command"
-        parts = self.parts()
+        parts = self.part_files()
         for part in parts:
             with wrap_read_errors(part, remedy):
                 check_parquet(part)
@@ -85,7 +85,7 @@ def _first_run(part: Path) -> int:
     return int(part.stem.removeprefix("run_"))
 
 
-def _runs_in(parts: list[Path]) -> set[int]:
+def _read_runs(parts: list[Path]) -> set[int]:
     import polars as pl
 
     if parts:
@@ -116,14 +116,14 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:
-        _lock(handle, out)
+        _lock_folder(handle, out)
         check_identity(out, identity)
         yield
     finally:
         os.close(handle)
 
 
-def _lock(handle: int, out: Path) -> None:
+def _lock_folder(handle: int, out: Path) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -133,7 +133,7 @@ def _lock(handle: int, out: Path) -> None:
 
 
 def check_identity(out: Path, identity: dict[str, Any]) -> None:
-    """Write the inputs of the rows into a new folder `out`; another folder must have the same."""
+    """Write the inputs of the rows into a new folder; raise an error if an old one has others."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():

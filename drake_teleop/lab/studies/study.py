@@ -88,7 +88,7 @@ def study_command(
     ):
         if both:
             raise DrakeTeleopError(
-                f"{first} and {second} exclude each other",
+                f"{first} and {second} cannot be combined",
                 where=str(path),
                 remedy="remove one of them",
             )
@@ -98,14 +98,14 @@ def study_command(
     data, where = ReadScenario(_scenario_path(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
-        _check_values(factor, f"{path}:factors[{index}]")
+        _check_factor_values(factor, f"{path}:factors[{index}]")
     work = StationWork(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
         study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
         shard=shard, merge=merge, progress=shown,
     )  # fmt: skip
-    summary = _summary(study, rows)
+    summary = _summarise_rows(study, rows)
     out = parse_shard(shard).folder(out) if shard else out
     with output_folder(out, kept=["runs.parquet"]):
         if not shard:
@@ -115,7 +115,7 @@ def study_command(
             write_pictures(study, rows, out)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(study, summary, out)
+        _print_summary(study, summary, out)
     return summary
 
 
@@ -132,9 +132,9 @@ def _scenario_path(study: Study, path: Path) -> str | Path:
     return study.scenario if known else path.parent / study.scenario
 
 
-def _check_values(factor: Factor, where: str) -> None:
+def _check_factor_values(factor: Factor, where: str) -> None:
     ranged = factor.low is not None and factor.high is not None
-    for value in (factor.low, factor.high) if ranged else factor.listed_values():
+    for value in (factor.low, factor.high) if ranged else factor.level_values():
         data = _apply_changes({}, {factor.field: value})
         check_ranges(settings_from_data(Scenario, data, where), where)
 
@@ -154,7 +154,7 @@ def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:
     return data
 
 
-def _summary(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
+def _summarise_rows(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
     figures = {}
     for name in study.measures:
         column = rows[name].drop_nulls()
@@ -171,7 +171,7 @@ def _summary(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
     }
 
 
-def _print(study: Study, summary: dict[str, Any], out: Path) -> None:
+def _print_summary(study: Study, summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

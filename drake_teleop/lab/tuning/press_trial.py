@@ -1,4 +1,4 @@
-"""Trials of settings: a hand swings, presses and holds."""
+"""Trials of settings: a simulated hand swings, presses and holds."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from drake_teleop.station.station import MakeTeleopStation
 MAX_REST_FORCE_N = 0.05
 """Largest rendered force above `REST_BAND_HZ` of a station at rest, free or pressing, rms [N]."""
 REST_BAND_HZ = 5.0
-MIN_SHARE = 0.9
+MIN_RENDERED_SHARE = 0.9
 """Smallest accepted rendered force, as a share of the scaled contact force."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
@@ -47,10 +47,10 @@ _REST_S, _JUDGED_S = 1.5, 0.8  # s, from the press to the judged time; length of
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_DEPTH, _DEVICE_SHARE = 0.02, 0.6  # m; share of the device's peak force that is used
 _SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
-_LOW_PASS_DELAY = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
+_FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
-KEEP_GAMMA = "as given"
+GIVEN_SETTINGS = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
 
@@ -93,7 +93,7 @@ def settings_from_values(values: Values) -> Settings:
 
 @dataclass(frozen=True)
 class StationTrial:
-    """Work of a study: one press in the whole station.
+    """Function that a study runs: one press in the whole station.
 
     Args:
         given: scenario of the user, with its own passivity and scales.
@@ -109,7 +109,7 @@ class StationTrial:
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.given
-        if values["method"] != KEEP_GAMMA:
+        if values["method"] != GIVEN_SETTINGS:
             scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
@@ -156,9 +156,9 @@ class StationTrial:
 
 @dataclass(frozen=True)
 class GammaSearch:
-    """Work of a study: the largest stable gamma in one axis at all corners.
+    """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `caps`: largest gamma by low-pass [Hz].
+    `caps`: low-pass [Hz] -> upper bound of gamma.
     """
 
     base: Scenario
@@ -169,7 +169,7 @@ class GammaSearch:
         settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
-        linear = self._linear_limit(axis, settings)
+        linear = self._linear_gamma_limit(axis, settings)
         cap = self.caps[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
@@ -181,7 +181,7 @@ class GammaSearch:
                 self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
             ]
             shares[gamma] = min(found)
-            return 1.0 if shares[gamma] >= MIN_SHARE else -1.0
+            return 1.0 if shares[gamma] >= MIN_RENDERED_SHARE else -1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
@@ -191,12 +191,12 @@ class GammaSearch:
                 if stability_sign(low) > 0
                 else -np.inf
             )
-        accepted = [gamma for gamma, share in shares.items() if share >= MIN_SHARE]
+        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_SHARE]
         gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
-    def _linear_limit(self, axis: Any, settings: Settings) -> float:
+    def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
         sampling = sampling_of_scenario(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -218,7 +218,7 @@ class GammaSearch:
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = 0.0 if self.base.wrist_sensor.ideal else _LOW_PASS_DELAY / settings.low_pass_hz
+        added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
         task = short_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
@@ -235,7 +235,7 @@ class GammaSearch:
 
 
 def short_task(round_trip: float) -> Task:
-    """Return the times of swing, rest and held press for a round trip [s]."""
+    """Return the times of a task (swing, rest, held press) for a round trip [s]."""
     pressed = 1.8 + 2 * round_trip
     release = pressed + _REST_S + _JUDGED_S + 2 * round_trip
     return Task(

@@ -18,9 +18,9 @@ from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study, Value
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
-    KEEP_GAMMA,
+    GIVEN_SETTINGS,
     MAX_REST_FORCE_N,
-    MIN_SHARE,
+    MIN_RENDERED_SHARE,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
@@ -29,19 +29,19 @@ from drake_teleop.lab.tuning.press_trial import (
     settings_from_values,
 )
 
-METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; the others are dominated by them or render less than `MIN_SHARE` of the force."""
-SIGMAS = (0.0, 0.3)
+CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
+"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_SHARE`."""
+CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
 WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
-_LOW_PASSES = (100.0, 50.0)  # Hz, below the sensor's own
-_HALVINGS = 4  # of gamma, until the station is stable
+_LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
+_MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
 _BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
-_QUIET_SHARE = 0.8  # share of the largest force at rest that noise may use
+_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
-Execute = Callable[[str, Study, Any], list[Row]]
+RunStudy = Callable[[str, Study, Any], list[Row]]
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,15 @@ class SearchResult:
     limits: list[Row]
 
 
-def search_settings(trial: StationTrial, execute: Execute) -> SearchResult:
-    """Return the stable settings with the smallest detection threshold."""
+def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
+    """Return the stable settings with which the operator detects the smallest force."""
     base, stated = trial.base, trial.stated
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_lists([KEEP_GAMMA], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        _study_of_lists([GIVEN_SETTINGS], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
         trial,
     )
     quiet = execute(
@@ -81,20 +81,20 @@ def search_settings(trial: StationTrial, execute: Execute) -> SearchResult:
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
-        low_passes += [f for f in _LOW_PASSES if stated.requirements.min_low_pass_hz <= f < own]
+        low_passes += [f for f in _LOW_PASSES_HZ if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
-    caps = {f: min(_QUIET_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    caps = {f: min(_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
     study = Study(
         factors=[
-            Factor(field="method", words=list(METHODS)),
-            Factor(field="sigma_inertia", values=list(SIGMAS)),
+            Factor(field="method", words=list(CANDIDATE_METHODS)),
+            Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
             Factor(field="low_pass_hz", values=low_passes),
         ],
         measures=SEARCH_MEASURES,
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
-    search = [_with_threshold(row, trial, noises) for row in rows]
+    search = [_add_threshold(row, trial, noises) for row in rows]
     candidates = _best_of_each_method(search)
     found: list[tuple[float, Settings, list[Row]]] = []
     for row in candidates:
@@ -107,7 +107,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> SearchResult:
             found.sort(key=lambda entry: entry[0])
     if not found:
         raise DrakeTeleopError(
-            "no settings were stable at all corners of the set",
+            "no settings were stable for all given hands and walls",
             where="tune",
             remedy="state firmer hands, softer walls or a faster network",
         )
@@ -126,7 +126,7 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 
 
 def _station_limit(
-    settings: Settings, trial: StationTrial, execute: Execute
+    settings: Settings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
@@ -147,7 +147,7 @@ def _station_limit(
         return rows
 
     gamma, failed, inside = settings.gamma, 0.0, []
-    for _ in range(1 + _HALVINGS):
+    for _ in range(1 + _MAX_GAMMA_HALVINGS):
         inside = run_at_gamma(gamma)
         if inside:
             break
@@ -166,10 +166,10 @@ def _station_limit(
 def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
+    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_SHARE)
 
 
-def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
+def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
     """Return a function that runs a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
@@ -187,10 +187,10 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+def _add_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
-    masked = row["sigma_inertia"] * scale * _load_force(trial)
+    masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
@@ -198,7 +198,7 @@ def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _load_force(trial: StationTrial) -> float:
+def _rms_load_force(trial: StationTrial) -> float:
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 

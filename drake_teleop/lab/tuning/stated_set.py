@@ -56,7 +56,7 @@ class StatedSet:
 
     @property
     def corners(self) -> list[tuple[str, float]]:
-        """Softest and firmest grip at the softest and stiffest wall; the hardest ones first."""
+        """Softest and firmest grip at the softest and stiffest wall; the stiffest wall first."""
         hands = dict.fromkeys((self.hands[0], self.hands[-1]))
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 

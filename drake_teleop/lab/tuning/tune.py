@@ -88,7 +88,7 @@ def tune(
         environment=given.environment,
         contact_detection=given.contact_detection,
     )
-    summary = _summary(found, tuned, stated, network)
+    summary = _make_summary(found, tuned, stated, network)
     with output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
@@ -102,11 +102,11 @@ def tune(
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary, out)
+        _print_sentences(summary, out)
     return summary
 
 
-def _summary(
+def _make_summary(
     found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
@@ -194,7 +194,7 @@ def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
     return figure
 
 
-def _print(summary: dict[str, Any], out: Path) -> None:
+def _print_sentences(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
 
     console = Console()
