@@ -110,7 +110,8 @@ def test_the_run_ends_with_one_line_if_the_scenario_says_so():
     fault = faults.Fault("nan", "load", 0.03, 0.01, 5, np.nan)
     taps["load"][0].change = faults.change_of(fault, station)
     with pytest.raises(
-        DrakeTeleopError, match=r"on_fault: at 0\.030 s the load estimate is no num"
+        DrakeTeleopError,
+        match=r"on_fault: the run stops at 0\.030 s by a fault: the load estimate is not finite",
     ):
         simulate(station, scenario.simulation, progress=False)
     taps["load"][0].change = None

@@ -224,7 +224,9 @@ def test_episodes_in_several_files_are_refused(tmp_path: Path) -> None:
     text = yaml.safe_load(path.read_text())
     text["pose"]["file"] = "other.parquet"
     path.write_text(yaml.safe_dump(text))
-    with pytest.raises(DrakeTeleopError, match="starts 2 times, and the streams are in several"):
+    with pytest.raises(
+        DrakeTeleopError, match="starts 2 times, which requires all streams in one file"
+    ):
         read_log(path)
 
 

@@ -80,8 +80,8 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
     for i in range(3):
         for k in range(3):
             R[i, k] = x[12 + 3 * i + k]
-    q = conjugate_quaternion(quaternion_of_matrix(R))
-    turn = quaternion_logarithm(quaternion_product(a, q))
+    inverse = conjugate_quaternion(quaternion_of_matrix(R))
+    turn = quaternion_logarithm(quaternion_product(a, inverse))
     squared = 0.0
     for i in range(3):
         e[i] = pose[4 + i] - x[9 + i]
