@@ -246,7 +246,9 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @option.separate_sigmas
 @option.gamma
 @click.option(
-    "--eta", type=option.FiniteNumber(0, 1), help="Kept share of the object; excludes other scales."
+    "--eta",
+    type=option.FiniteNumber(0, 1),
+    help="With --gripper: kept share of the object's non-contact wrench; not with other scales.",
 )
 @click.option(
     "--offsets",

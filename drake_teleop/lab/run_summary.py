@@ -21,7 +21,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.run_warnings import run_warnings
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
+from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.posture_shapes import start_overlaps
 from drake_teleop.station.task_measures import task_failure, task_measures
@@ -144,8 +144,8 @@ def _describe_unmodelled_contact(scenario: Scenario) -> str:
 
 def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
     displacements, rotations = {}, {}
-    for signal in (name for name in result.signals if name.startswith(POSE_SIGNAL_PREFIX)):
-        name, first, last = signal.removeprefix(POSE_SIGNAL_PREFIX), *result[signal][[0, -1]]
+    for signal in (name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)):
+        name, first, last = signal.removeprefix(MOVING_BODY_POSE_PREFIX), *result[signal][[0, -1]]
         displacements[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
         rotation = quaternion_logarithm(
             quaternion_product(tuple(last[:4]), conjugate_quaternion(tuple(first[:4])))

@@ -150,11 +150,11 @@ class DeviceLink:
 
     def status_text(self) -> str:
         if not self.refused:
-            return self._delay_text()
+            return self._link_text()
         reason = f"the last one {self.refusal}"
-        return f"{self._delay_text()}. Refused packets: {self.refused}; {reason}"
+        return f"{self._link_text()}. Refused packets: {self.refused}; {reason}"
 
-    def _delay_text(self) -> str:
+    def _link_text(self) -> str:
         now = self._polled_at
         if self.is_silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"

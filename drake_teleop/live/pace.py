@@ -1,4 +1,4 @@
-"""Timing of simulation slices by a clock."""
+"""Real-time schedule of a live session's simulation slices, and their lateness."""
 
 from __future__ import annotations
 

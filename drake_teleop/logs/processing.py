@@ -390,7 +390,7 @@ def eliminate_log(
     if free_motion is not None and (found.log.static or free_motion.log.static):
         source = (free_motion if free_motion.log.static else found).log.source
         raise DrakeTeleopError(
-            "contains poses at rest, which have no contact",
+            "contains only poses at rest (`static`), in which no contact can be detected",
             where=source,
             remedy="give a log of a motion",
         )
@@ -656,7 +656,7 @@ def detect_log(
     )
     if found.log.static:
         raise DrakeTeleopError(
-            "contains poses at rest, which have no contact",
+            "contains only poses at rest (`static`), in which no contact can be detected",
             where=found.log.source,
             remedy="give a log of a motion",
         )

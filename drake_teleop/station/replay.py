@@ -35,7 +35,7 @@ from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
+from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import (
@@ -117,7 +117,7 @@ def write_replay(
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = _nearest_rows(result.t, times)
     # Read each signal of a log on disk once, and keep only the displayed rows.
-    moving = [name for name in result.signals if name.startswith(POSE_SIGNAL_PREFIX)]
+    moving = [name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)]
     shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
     signals = {name: result[name][rows] for name in shown}
     contact = np.zeros(len(result.t), dtype=bool)
@@ -221,7 +221,8 @@ class ReplayScene:
             self._master = _add_haptic_device(self.plant, scenario)
         finalize_plant(self.plant)
         self._moving_bodies = {
-            POSE_SIGNAL_PREFIX + k: body for k, body in MovingBodies(self.plant, touched).items()
+            MOVING_BODY_POSE_PREFIX + k: body
+            for k, body in MovingBodies(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))

@@ -14,7 +14,7 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
 
 
 #: Prefix of the pose signals of moving bodies of the surroundings.
-POSE_SIGNAL_PREFIX = "pose_of_"
+MOVING_BODY_POSE_PREFIX = "pose_of_"
 
 _WRENCH_AXES_AND_UNITS = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
 _POSE_AXES_AND_UNITS = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
@@ -131,11 +131,11 @@ SIGNALS = {
 
 def signal_of(name: str, size: int) -> Signal:
     """Return the description of a signal with `size` components, for any number of joints."""
-    if name.startswith(POSE_SIGNAL_PREFIX):
+    if name.startswith(MOVING_BODY_POSE_PREFIX):
         return _signal(
             name,
             *_POSE_AXES_AND_UNITS,
-            f"where the body {name.removeprefix(POSE_SIGNAL_PREFIX)} is, in W, at t",
+            f"where the body {name.removeprefix(MOVING_BODY_POSE_PREFIX)} is, in W, at t",
         )
     signal = SIGNALS[name]
     if size == len(signal.components):

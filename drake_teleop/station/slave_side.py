@@ -19,7 +19,7 @@ from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE_S, ForceSc
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
-from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
+from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
 from drake_teleop.station.slave.joint_commands import (
@@ -357,9 +357,9 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         if slave.sheet_in_compiled_law is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
     for name, body in slave.contact.moving.items():
-        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingBodyPose(plant, body))
+        pose = builder.AddNamedSystem(MOVING_BODY_POSE_PREFIX + name, MovingBodyPose(plant, body))
         builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
-        export_outputs(builder, pose, **{POSE_SIGNAL_PREFIX + name: "pose"})
+        export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:

@@ -10,7 +10,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import signals_of_sample
-from drake_teleop.station.signals import LOG_BLOCK_NAME, POSE_SIGNAL_PREFIX, SIGNALS
+from drake_teleop.station.signals import LOG_BLOCK_NAME, MOVING_BODY_POSE_PREFIX, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
 COMBINED_PORTS = {
@@ -57,7 +57,7 @@ def record_signals(
         for port in (side.get_output_port(i) for i in range(side.num_output_ports()))
     }
     signals = [name for name in SIGNALS if name in outputs]
-    signals += [name for name in outputs if name.startswith(POSE_SIGNAL_PREFIX)]
+    signals += [name for name in outputs if name.startswith(MOVING_BODY_POSE_PREFIX)]
     for name in signals:
         builder.ExportOutput(outputs[name], name)
     wide = {

@@ -260,7 +260,7 @@ def test_base_axes_are_rotated_to_S_by_the_orientation(tmp_path: Path) -> None:
             {"wrench__force__columns": ["F0", "F1", "FF2"]},
             ["wrench.force.columns", "did you mean F2"],
         ),
-        ({"wrench__force__columns": ["F0", "F1"]}, ["wrench.force.columns", "2 columns where 3"]),
+        ({"wrench__force__columns": ["F0", "F1"]}, ["wrench.force.columns", "2 columns, but 3"]),
         ({"imu__specific_force__columns": ["clock"]}, ["imu.specific_force.columns", "1 columns"]),
         (
             {"wrench__time": {"column": "time", "unit": "ms"}},
@@ -270,7 +270,7 @@ def test_base_axes_are_rotated_to_S_by_the_orientation(tmp_path: Path) -> None:
         ({"pose__time": {"column": "q0"}}, ["pose.time", "decrease", "time.rate"]),
         (
             {"pose__orientation": {"columns": ["q0", "q1", "q2"], "form": "quaternion_wxyz"}},
-            ["pose.orientation.columns", "3 columns where 4"],
+            ["pose.orientation.columns", "3 columns, but 4"],
         ),
         (
             {"pose__orientation": {"columns": ["q0", "q1", "q2", "q2"], "form": "quaternion_wxyz"}},

@@ -57,7 +57,7 @@ def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> No
         ("x.csv", "a,b\n1,2\n3,nan\n4,nan\n", ["b"], ["in 2 rows, the first is row 3"]),
         ("x.csv", "a,b\n1,2\n3,inf\n", ["b"], ["no finite number"]),
         ("x.csv", "a,b\n1,2\n3,4,5\n", ["b"], ["cannot be read"]),
-        ("x.csv", "a,b\n1,2\n", ["a", "b"], ["2 columns where 1 are needed", "here:"]),
+        ("x.csv", "a,b\n1,2\n", ["a", "b"], ["lists 2 columns, but 1 are needed", "here:"]),
         ("x.csv", "a,b\n", ["a"], ["holds no rows"]),
         ("x.csv", "", ["a"], ["cannot be read"]),
         ("x.parquet", "no parquet", ["a"], ["cannot be read", "valid .parquet"]),

@@ -95,7 +95,9 @@ def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
         raise DrakeTeleopError(
-            "the ratio of powers is not positive", where="ratio", remedy="give values above 0"
+            "the ratio of slave power to master power is not positive",
+            where="ratio",
+            remedy="give values above 0",
         )
     h11, h12, h21, h22 = matrix_entries(H)
     return two_port_matrix(h11, h12 / root, h21 * root, h22)

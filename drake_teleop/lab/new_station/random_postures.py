@@ -123,7 +123,11 @@ def random_postures(arm: ArmModel) -> Postures:
 def select_suitable_postures(
     postures: Postures, plane: float, tool_length: float
 ) -> tuple[Postures, Region]:
-    """Return suitable postures, and the region on the side with most of them."""
+    """Return postures with the tool downwards, in reach and above `plane`, and their region.
+
+    Only those on the side of the first joint with most of them; `plane` is the height z_W of
+    the arm's base [m].
+    """
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
     radius = np.hypot(from_first[:, 0], from_first[:, 1])

@@ -22,9 +22,9 @@ from drake_teleop.lab.studies.level_model import (
     TOO_FEW_POINTS,
     BooleanArray,
     LevelModel,
-    assign_levels,
     fit_level_model,
     largest_complete_block,
+    levels_of_factor_values,
     missing_value_reasons,
 )
 
@@ -257,7 +257,9 @@ class _MeasureData:
         used = np.ix_(known, seen.any(axis=0))
         self.table = fill_missing(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
-        self.levels = [assign_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
+        self.levels = [
+            levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)
+        ]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]

@@ -74,7 +74,7 @@ class Levels:
     middles: Array
 
 
-def assign_levels(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
+def levels_of_factor_values(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
@@ -217,7 +217,9 @@ def fit_level_model(
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:
-        levels = [assign_levels(f, c, parts) for f, c in zip(factors, columns, strict=True)]
+        levels = [
+            levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
+        ]
         model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model

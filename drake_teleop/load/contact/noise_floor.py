@@ -114,7 +114,9 @@ class NoiseFloor:
             )
         if np.linalg.eigvalsh(correlation).min() <= 0.0:
             raise DrakeTeleopError(
-                "is not positive definite", where="correlation", remedy="call fit_noise_floor"
+                "the matrix is not positive definite",
+                where="correlation",
+                remedy="call fit_noise_floor",
             )
 
     def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:

@@ -184,7 +184,9 @@ class RecursiveEstimator(ABC):
         if shapes != [(6,), (3,), (3,), (3,)]:
             names = "wrench, s, omega, alpha"
             remedy = "pass shapes (6,), (3,), (3,), (3,)"
-            raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample", remedy=remedy)
+            raise DrakeTeleopError(
+                f"{names} of one sample have shapes {shapes}", where="sample", remedy=remedy
+            )
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
             raise DrakeTeleopError(

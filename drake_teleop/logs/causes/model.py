@@ -136,7 +136,7 @@ class Model:
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
         width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
-        motion = self._motion_coefficients(x)
+        motion = self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
@@ -172,7 +172,7 @@ class Model:
                 rows = x[:, self.slices[name]].reshape(-1, 6, degree)
                 out[:, :, TIME.start : TIME.start + degree] += rows
 
-    def _motion_coefficients(self, x: Array) -> Array:
+    def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))

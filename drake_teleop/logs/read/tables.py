@@ -80,7 +80,7 @@ class Table:
                 out[:, found - column.shape[1] : found] = column
         if found != width:
             raise DrakeTeleopError(
-                f"{found} columns where {width} are needed",
+                f"lists {found} columns, but {width} are needed",
                 where=where,
                 remedy=f"list {width} columns of {self.path.name}",
             )

@@ -56,7 +56,7 @@ from drake_teleop.station.passivity.packet import (
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 RESERVE_MARGIN = 0.03  #: share of the slave's reserve that is never used
 SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
-_MIN_KEPT_RESERVE = 0.05
+_MIN_KEPT_RESERVE_SHARE = 0.05
 _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
 _ENERGY_CAPACITY = 4.0  # over the reserve
 _SLAVE_FILTER_S = 3e-3
@@ -70,7 +70,7 @@ _MIN_FIT_M, _MAX_FIT_M = 1e-3, 1e-2
 _FAST_SPEED = 0.15  # m/s
 _SHARE_FILTER_S, _SHARE_DEADBAND = 0.02, 0.1
 _REMOVAL_FORCE_N = 0.3
-_DIRECTION_FILTER_S = 3.0
+_CONTACT_DIRECTION_FILTER_S = 3.0
 _SLIP_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
 _GAIN_RISE_S, _MIN_GAIN, _MAX_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
 _COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
@@ -151,7 +151,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
         # A wrench far above the mean, which may be noise, replaces it at once.
         square = max(wrench_component_along(wrench, wrench, p), 1e-300)
         jump = 1.0 - 3.0 * math.sqrt(wrench_component_along(mean, mean, p) / square)
-        rate = max(min(T / max(_DIRECTION_FILTER_S, 2.0 * round_trip), 1.0), jump)
+        rate = max(min(T / max(_CONTACT_DIRECTION_FILTER_S, 2.0 * round_trip), 1.0), jump)
         if not wrench_component_along(wrench, mean, p) > 0.0:  # another contact
             rate = 1.0
     for i in range(6):
@@ -243,7 +243,7 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     if in_contact and speed < _REST_SPEED * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - SHARED_RESERVE) * reserve, _REST_SEND_RATE
         needed += SHARED_RESERVE * reserve
-        returned = min(free - _MIN_KEPT_RESERVE * reserve, missing)
+        returned = min(free - _MIN_KEPT_RESERVE_SHARE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
     lost = max(ledger[g] - returned - _ENERGY_CAPACITY * reserve, 0.0)

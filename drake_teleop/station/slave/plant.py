@@ -82,8 +82,9 @@ class SlavePlant:
     def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
         """Argument `physics` of `plant_rates`.
 
-        It contains the arm's table with dry friction, a view of its load (for grasps), pairs of
-        shapes, leaf, joints of moving bodies, and no given wrenches.
+        It contains the arm's table with dry friction, and the load in this table, which a grasp
+        changes. Then follow pairs of shapes in contact, the sheet spring's leaf, joints of moving
+        bodies, and an empty array of given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION_COLUMN] = self.joint_friction

@@ -50,7 +50,7 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
         measured = {site for each in mjcf.elements_in("sensor") if (site := _measured_site(each))}
-        arm = _insert_body_at_site(arm, sensor, is_measured=sensor in measured)
+        arm = _insert_sensor_frame_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
@@ -156,7 +156,7 @@ def _split_into_one_joint_bodies(body: Body) -> Body:
     return outer
 
 
-def _insert_body_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
+def _insert_sensor_frame_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
     """Add a massless body at the pose of a site, as sensor frame.
 
     The new body carries the site's body if a `force` or `torque` sensor measures there
@@ -164,7 +164,8 @@ def _insert_body_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
     """
     if site not in body.sites:
         body.children = [
-            _insert_body_at_site(child, site, is_measured=is_measured) for child in body.children
+            _insert_sensor_frame_at_site(child, site, is_measured=is_measured)
+            for child in body.children
         ]
         return body
     X_BS = body.sites.pop(site)
