@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -208,31 +208,37 @@ def summarized(cells: list[dict[str, Any]], fps: float) -> dict[str, float]:
     }
 
 
+def command(folder: Path, out: str) -> list[str]:
+    start = "from drake_teleop.cli.main import main; main()"
+    words = [sys.executable, "-c", start, "dataset", str(folder / "in"), "--identify", "--quiet"]
+    return [*words, "--out", str(folder / out)]
+
+
 def long_dataset(folder: Path, frames: int) -> dict[str, float]:
+    """Return CPU time and largest memory of the command, in a process of its own."""
     length = 1000
     write_sample_dataset(folder / "in", episodes=frames // length, duration_s=length / 30)
-    started = time.process_time()
-    dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return {"frames": frames, "cpu_s": time.process_time() - started, "peak_GB": peak}
+    _, status, used = os.wait4(subprocess.Popen(command(folder, "out")).pid, 0)
+    if status:
+        raise SystemExit("the command has failed")
+    cpu, peak = used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20
+    return {"frames": frames, "cpu_s": cpu, "peak_GB": peak}
 
 
 def killed_dataset(folder: Path, whole_s: float = 40.0, kills: int = 6) -> dict[str, float]:
     """Kill the command at random times; compare the copy with that of an undisturbed run."""
     write_sample_dataset(folder / "in", episodes=100)
-    start = "from drake_teleop.cli.main import main; main()"
-    words = [sys.executable, "-c", start, "dataset", str(folder / "in"), "--identify", "--quiet"]
-    subprocess.run([*words, "--out", str(folder / "whole")], check=True)
+    subprocess.run(command(folder, "whole"), check=True)
     pauses, killed = random.Random(52), 0
     while killed < kills:
-        process = subprocess.Popen([*words, "--out", str(folder / "killed")])
+        process = subprocess.Popen(command(folder, "killed"))
         try:
             process.wait(timeout=pauses.uniform(1.0, whole_s / kills))
             break
         except subprocess.TimeoutExpired:
             process.kill()
             killed += process.wait() == -signal.SIGKILL
-    subprocess.run([*words, "--out", str(folder / "killed")], check=True)
+    subprocess.run(command(folder, "killed"), check=True)
     copies = [
         {str(file.relative_to(copy)): file.read_bytes() for file in copy.rglob("*.*")}
         for copy in (folder / "whole" / "in", folder / "killed" / "in")

@@ -191,7 +191,9 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     before = estimator.phi
     with pytest.raises(DrakeTeleopError, match=r"^sample: contains NaN or infinity"):
         estimator.update(np.full(6, np.nan), REST, REST, REST)
-    with pytest.raises(DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha of one sample have shapes"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha of one sample have shapes"
+    ):
         estimator.update(np.zeros(3), np.zeros(6), REST, REST)
     np.testing.assert_array_equal(estimator.phi, before)
     with pytest.raises(

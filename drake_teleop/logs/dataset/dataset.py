@@ -62,7 +62,9 @@ from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_description
 
-_MAX_CALIBRATION_EPISODES = 24  # episodes that determine load, lag and noise
+# Episodes that determine load, lag and noise: fewer if they are long.
+_MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
+_MAX_CALIBRATION_FRAMES = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
 _MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
@@ -274,7 +276,11 @@ def _open_work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
 def _estimate_shared_load(
     dataset: Dataset, streams: dict[str, Any], known: Identification | None, progress: Any
 ) -> SharedLoad:
-    step = -(-len(dataset.episodes) // _MAX_CALIBRATION_EPISODES)
+    frames = max(np.median([episode.rows for episode in dataset.episodes]), 1)
+    count = np.clip(
+        _MAX_CALIBRATION_FRAMES // frames, _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES
+    )
+    step = -(-len(dataset.episodes) // int(count))
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
         try:

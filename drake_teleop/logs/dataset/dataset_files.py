@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,11 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.table_files import columns_with_nested, read_table
+from drake_teleop.logs.read.table_files import (
+    columns_with_nested,
+    numeric_column_names,
+    read_table,
+)
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
@@ -69,10 +74,18 @@ class Dataset(NamedTuple):
             if self.kind == "zarr":
                 arrays = read_zarr(episode.file / "data", rows=rows)
                 return Table(episode.file, _with_element_columns(arrays))
-            import polars as pl
+            frame = _numeric_frame(episode.file, episode.file.stat().st_mtime_ns)
+            part = frame.slice(episode.first, episode.rows)
+            return Table(episode.file, columns_with_nested(part))
 
-            frame = pl.scan_parquet(episode.file).slice(episode.first, episode.rows)
-            return Table(episode.file, columns_with_nested(frame))
+
+@lru_cache(maxsize=1)
+def _numeric_frame(file: Path, modified_ns: int) -> Any:
+    """Return the columns of a Parquet file without text and images; the last file is kept."""
+    import polars as pl
+
+    frame = pl.scan_parquet(file)
+    return frame.select(numeric_column_names(frame)).collect().lazy()
 
 
 def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -202,10 +215,8 @@ def _write_parquet(path: Path, target: Path, new: NewColumns) -> None:
     import polars as pl
 
     frame = pl.read_parquet(path)
-    wrench = pl.Series(CONTACT_WRENCH, new.contact_wrench.astype(np.float32).tolist())
-    frame = frame.with_columns(
-        wrench.cast(pl.List(pl.Float32)), pl.Series(IN_CONTACT, new.in_contact)
-    )
+    wrench = pl.Series(CONTACT_WRENCH, np.ascontiguousarray(new.contact_wrench, np.float32))
+    frame = frame.with_columns(wrench.arr.to_list(), pl.Series(IN_CONTACT, new.in_contact))
     kept = {k: v for k, v in pl.read_parquet_metadata(path).items() if k != "ARROW:schema"}
     if "huggingface" in kept:
         kept["huggingface"] = _add_features_to_metadata(kept["huggingface"])

@@ -97,15 +97,19 @@ def columns_with_nested(frame: pl.LazyFrame) -> dict[str, NDArray]:
 
     Columns of text and binary data, such as images, are omitted.
     """
+    frame = frame.select(numeric_column_names(frame)).collect().lazy()
+    return _collect_columns(frame, _column_expressions(frame))
+
+
+def numeric_column_names(frame: pl.LazyFrame) -> list[str]:
+    """Return the names of the columns of numbers, lists and arrays."""
     import polars as pl
 
-    numeric = [
+    return [
         name
         for name, dtype in frame.collect_schema().items()
         if dtype.is_numeric() or isinstance(dtype, (pl.List, pl.Array))
     ]
-    frame = frame.select(numeric).collect().lazy()
-    return _collect_columns(frame, _column_expressions(frame))
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
