@@ -48,7 +48,7 @@ class PageScene:
             self._report_failure(error)
 
     def show(self, rows: LogRows) -> dict[str, Any]:
-        """Return poses (4x4 matrices by columns) and sizes of the objects by Meshcat path."""
+        """Return a message: poses (4x4, by columns) and sizes of the last row by Meshcat path."""
         moves = {} if self.failure else self._scene_changes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 

@@ -108,7 +108,8 @@ class FourierTrajectory:
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
         if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):
             raise DrakeTeleopError(
-                "is not a trajectory: q0, rho and delta differ in shape, or a number is not finite",
+                "is not a trajectory: q0, rho and delta differ in shape, a number is not finite, or"
+                " the frequency is not above 0",
                 where=str(path),
                 remedy="give each joint one q0, and one rho and delta per harmonic",
             )

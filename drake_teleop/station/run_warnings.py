@@ -184,7 +184,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             " more than its delay explains,",
             spans,
         )
-    yield from _check_energy(result, scenario)
+    yield from _check_reserve_speed_limit(result, scenario)
     oscillating = find_unexplained_pose_oscillation(t, sent, received, REVERSAL_WINDOW_S + window)
     yield (
         f"the channel ({by}) makes the slave's command oscillate",
@@ -192,7 +192,9 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     )
 
 
-def _check_energy(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _check_reserve_speed_limit(
+    result: SimulationResult, scenario: Scenario
+) -> Iterator[tuple[str, Spans]]:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return

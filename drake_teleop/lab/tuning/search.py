@@ -49,10 +49,10 @@ class SearchResult:
     """Result of the search.
 
     Attributes:
-        search: rows of the search in one axis, with the predicted `threshold_N` and `gamma`.
-        given: rows of the user's settings at the stiffest wall.
-        inside: rows of the chosen settings at the corners, with gamma times the margin.
-        limits: rows at the chosen gamma, at the stiffest wall and beyond it.
+        search: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
+        given: runs of the user's settings at the stiffest wall.
+        inside: runs of the chosen settings for extreme hands and walls, gamma times margin.
+        limits: runs of the chosen settings at the stiffest wall and at stiffer ones.
     """
 
     settings: Settings

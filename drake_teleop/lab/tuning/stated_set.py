@@ -94,7 +94,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
-    """Return the scenario over `network`, without environment, task and method."""
+    """Return the scenario over `network` with sigma 0, without environment, task and method."""
     if network is not None and network not in PRESETS:
         remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)

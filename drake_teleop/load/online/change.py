@@ -355,7 +355,7 @@ def initial_change_memory(
 
 
 @njit(cache=True)
-def known_load_in_memory(memory):
+def stored_known_load(memory):
     return memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 16]
 
 
@@ -370,7 +370,7 @@ def current_change_state(memory):
 
 
 @njit(cache=True)
-def new_load_in_memory(memory):
+def stored_new_load(memory):
     return memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
 
 

@@ -19,9 +19,9 @@ from drake_teleop.load.online.change import (
     STATE_CHANGED,
     STATE_KNOWN,
     current_change_state,
-    known_load_in_memory,
     new_load_age,
-    new_load_in_memory,
+    stored_known_load,
+    stored_new_load,
     update_change_detector,
 )
 from drake_teleop.load.regressor import (
@@ -121,7 +121,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     update_change_detector(watch, sample, block, noise, window, hold, bound)
-    known, residual, target = known_load_in_memory(watch), np.empty(6), np.empty(16)
+    known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
     s, omega, alpha = (
         sample[SAMPLE_SPECIFIC_FORCE],
         sample[SAMPLE_ANGULAR_VELOCITY],
@@ -142,7 +142,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
         other = (
             verdict == STATE_CHANGED
             and force_changed
-            and _is_com_within_reach(known, new_load_in_memory(watch))
+            and _is_com_within_reach(known, stored_new_load(watch))
         )
         memory[_STATE] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)

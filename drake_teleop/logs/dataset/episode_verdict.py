@@ -408,9 +408,10 @@ class EpisodeSignals:
         return regressor(*self.motion_at_lag(lag)[:3])
 
     def reading_predictor(self, phi: Array) -> PredictReading:
-        """Return a function of kind (`HYPOTHESIS_KINDS`) and lag [frames].
+        """Return a function that predicts the reading from load phi (10,) under a hypothesis.
 
-        It returns the reading in the axes of S, and the wrench of load phi (10,) to compare with.
+        It takes the hypothesis (`HYPOTHESIS_KINDS`) and the lag [frames], and returns the measured
+        wrench in the axes of S and the predicted one.
         """
 
         @cache

@@ -26,7 +26,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
+_MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
 _LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
 _FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = (
@@ -103,7 +103,10 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
     """Return the load that explains an episode best, and its lag."""
     search = HypothesisSearch(
-        signals.reading_predictor(np.zeros(10)), signals.regressor_at_lag, 0.0, _MIN_HALF_WIDTH
+        signals.reading_predictor(np.zeros(10)),
+        signals.regressor_at_lag,
+        0.0,
+        _MIN_RESIDUAL_HALF_WIDTH,
     )
     lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
     return min(
@@ -123,7 +126,7 @@ def _excess_spread(
 
 def _hypothesis_at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
     search = HypothesisSearch(
-        signals.reading_predictor(phi), signals.regressor_at_lag, near, _MIN_HALF_WIDTH
+        signals.reading_predictor(phi), signals.regressor_at_lag, near, _MIN_RESIDUAL_HALF_WIDTH
     )
     lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
     return min(

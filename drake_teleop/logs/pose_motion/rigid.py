@@ -110,7 +110,7 @@ _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return the coefficients (6, 16) of a load phi (10,) in the linear model, Eq. (T73).
 
-    The wrench does not contain the weight of `removed_weight` [m, m c] (4,).
+    `removed_weight` [m, m c] (4,) is the load whose weight the robot removed from the wrench.
     """
     C = _load_coefficients(phi)
     if removed_weight is not None:

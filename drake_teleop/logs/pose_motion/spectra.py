@@ -123,7 +123,7 @@ def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> Frequenc
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
-    """Return a taper (M,): 1 from `start` to `stop` [s], 0 outside, with cosine ramps."""
+    """Return a taper (M,): 0 outside `start` to `stop` [s], 1 inside after cosine ramps."""
     ramp = min(TAPER_RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)

@@ -53,7 +53,7 @@ class _CScalar:
 
 
 class _CArray:
-    """C pointer into parameter `array`; a size may be the name of a C parameter."""
+    """Pointer in C to elements of the parameter named `array`; sizes are numbers or names."""
 
     def __init__(self, text: str, shape: tuple[int | str, ...], array: str) -> None:
         self.text, self.shape, self.array = text, shape, array
@@ -207,7 +207,9 @@ class _Function:
             self._values[target.id] = self._store_in_variables(value)
         elif isinstance(value, (tuple, _CArray)):
             if self._indent > 1:
-                raise self._unsupported_error(target, "a branch or loop assigns only numbers")
+                raise self._unsupported_error(
+                    target, "tuples and arrays cannot be assigned in a branch or loop"
+                )
             self._values[target.id] = self._store_in_variables(value)
         else:
             if isinstance(self._values.get(target.id), _CScalar) and target.id not in self._locals:

@@ -29,7 +29,7 @@ from drake_teleop.station.passivity.packet import (
 STOP_TIME_S = 0.05  #: time in which a silent end comes to rest [s]
 RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 
-_RETREAT_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
+_HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _layout = SlotAllocator(MASTER_MONITOR_SIZE)
@@ -148,14 +148,14 @@ def limit_retreat_of_hand(twist, T, p, memory, wrench):
 
     It falls to 0 for hand speeds along the wrench between `MAX_RETREAT` and twice this.
     """
-    velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_VELOCITY_FILTER_S, 1.0)
+    velocity, rate = memory[HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):
         size = length_of_group(wrench, g)
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
-            slowing = (along - dot_of_group(wrench, twist, g) / size) / _RETREAT_VELOCITY_FILTER_S
+            slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
             share = max(2.0 - along / p[MAX_RETREAT][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)

@@ -55,18 +55,22 @@ class JointCoupling(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def _coupled_joints(self, context: Context) -> Array:
+    def _commanded_joint_positions(self, context: Context) -> Array:
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
         joints: Array = memory[:n]
         return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
 
     def _calc_joints(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._coupled_joints(context))
+        output.SetFromVector(self._commanded_joint_positions(context))
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        pose_into(self._table, np.array(self._coupled_joints(context)), output.get_mutable_value())
+        pose_into(
+            self._table,
+            np.array(self._commanded_joint_positions(context)),
+            output.get_mutable_value(),
+        )
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(0)
-        memory[:-1] = self._coupled_joints(context)
+        memory[:-1] = self._commanded_joint_positions(context)
         memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5

@@ -43,7 +43,7 @@ _MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue o
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an environment in a plant; `sheet` is that of the leaf, or None."""
+    """Model instances of an environment; `sheet` is that of the leaf or `moving_part`, or None."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
