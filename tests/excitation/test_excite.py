@@ -341,7 +341,9 @@ def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
 @pytest.mark.slow
 def test_identification_refuses_an_unsuitable_trajectory(short):
     scenario = LoadScenario("identification")
-    with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"has a period of 2\.4 s, but the simulation lasts 6 s"
+    ):
         identify_load(scenario, trajectory=short.trajectory)
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: uses 1\d\d\.\d% of the"):
