@@ -52,7 +52,7 @@ _NO_FAULT, _STALE_FAULT, _READING_FAULT, _JOINTS_FAULT, _LOAD_FAULT = map(
 
 
 class Scales(NamedTuple):
-    """Scales of parts of the wrench: sigma_ for inertia, weight_ for weight, gamma for contact."""
+    """Scales of the wrench: `sigma_...` of inertia, `weight_...` of weight, gamma of contact."""
 
     sigma_gripper: float
     sigma_object: float

@@ -100,7 +100,7 @@ def _place_box_at_body(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
-    """Return a code PROXIMITY_ for the tool; `pairs`, `watched`: `ShapePairs.known`, `.watched`."""
+    """Return a code `PROXIMITY_...`; `pairs` and `watched` are those of `ShapePairs`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
