@@ -600,3 +600,42 @@ def test_residual_only_where_the_load_moves_rejects_nothing(known, moving, push)
     assert note == (NOTHING_REJECTED_NOTE if late else "")
     assert rejected[(t > 5.0) & (t < 6.0)].all() == bool(push)
     assert not rejected[(t < 4.6) | (t > 6.4)].any()
+
+
+T_SMOOTH = np.arange(180) / 30.0
+STILL = np.tile([1.0, 0.0, 0.0, 0.0], (180, 1))
+PATH = np.stack([0.1 * np.sin(2 * T_SMOOTH), 0 * T_SMOOTH, 0.05 * np.cos(5 * T_SMOOTH)], axis=1)
+GAP = (T_SMOOTH < 2.0) | (T_SMOOTH > 3.5)
+EXACT_POSITIONS = {
+    "zero": 0.0 * PATH,
+    "constant": 0.0 * PATH + [0.5, 0.1, 0.3],
+    "uniform": np.outer(T_SMOOTH, [0.1, 0.0, 0.0]),
+    "rounded to 1 mm": PATH.round(3),
+    "moving": PATH,
+}
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(20), GAP], ids=["whole", "short", "gap"])
+@pytest.mark.parametrize("name", EXACT_POSITIONS)
+def test_smooth_splines_of_exact_poses_are_finite(name, rows):
+    poses = Poses(T_SMOOTH[rows], EXACT_POSITIONS[name][rows], STILL[rows])
+    motion = PoseSplines(poses, 2 / 30, smooth=True).motion(T_SMOOTH, np.array([0.0, 0.0, -9.81]))
+    assert all(np.isfinite(x).all() for x in motion)
+    if name in ("zero", "constant", "uniform"):
+        assert np.abs(motion[0] - [0.0, 0.0, 9.81]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("noise_m", "largest"), [(2e-5, 0.003), (2e-4, 0.01)])
+def test_smooth_splines_follow_the_acceleration_up_to_the_ends(noise_m, largest):
+    true = np.stack(
+        [-0.4 * np.sin(2 * T_SMOOTH), 0 * T_SMOOTH, -1.25 * np.cos(5 * T_SMOOTH)], axis=1
+    )
+    inside, ends = [], []
+    for seed in range(8):
+        noise = noise_m * np.random.default_rng(seed).normal(size=PATH.shape)
+        splines = PoseSplines(Poses(T_SMOOTH, PATH + noise, STILL), 2 / 30, smooth=True)
+        error = splines.motion(T_SMOOTH, np.zeros(3))[0] - true
+        inside.append(error[20:-20])
+        ends.append(error[[0, -1]])
+    assert np.sqrt(np.mean(np.square(inside))) < largest
+    assert np.sqrt(np.mean(np.square(ends))) < 9 * largest

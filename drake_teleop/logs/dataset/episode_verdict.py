@@ -346,6 +346,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     return None if best is None else best[1:]
 
 
+_MIN_KNOT_SPACING_S = 0.04
 _MARGIN_FRAMES = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
 
 
@@ -371,7 +372,8 @@ class EpisodeSignals:
         self._splines = None
         if log.posed is not None:
             poses = log.posed.poses
-            self._splines = PoseSplines(poses, MIN_POSES_PER_KNOT / poses.rate, smooth=True)
+            spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_KNOT_SPACING_S)
+            self._splines = PoseSplines(poses, spacing, smooth=True)
         grid = (
             np.arange(
                 -_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,

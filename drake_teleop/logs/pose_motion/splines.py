@@ -25,7 +25,7 @@ GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 _NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
 _LIMITED_ORDERS = range(1, 5)  # of derivatives at the ends
-_MIN_SMOOTH_HZ = 0.05  # lowest cutoff frequency of the smoothed splines
+_MAX_WEIGHT_RATIO = 1e12  # weight of penalty and limits over that of the poses, for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +142,8 @@ class PoseSplines:
         root = diags_array(np.sqrt(np.diff(knots[SPLINE_DEGREE:-SPLINE_DEGREE])))
         root = root @ _derivative_map(knots, SPLINE_DEGREE)
         penalty = _band((root.T @ root).tocsr())
+        largest = _MAX_WEIGHT_RATIO * gram[-1].max()
+        lowest = (self.rate * penalty[-1].max() / largest) ** (0.5 / SPLINE_DEGREE) / (2 * np.pi)
         coefficients = np.empty_like(right)
         for part in (slice(0, 3), slice(3, 7)):
 
@@ -157,17 +159,19 @@ class PoseSplines:
                 cost = poses * np.log(misfit) + 2 * np.log(factor[-1]).sum() - rank * np.log(weight)
                 return band, misfit / (poses * c.shape[1]), cost
 
-            bounds = np.log([_MIN_SMOOTH_HZ, self.rate])
+            bounds = np.log([min(lowest, 0.5 * self.rate), self.rate])
             best = minimize_scalar(
                 lambda x: penalized(x)[2], bounds=bounds, method="bounded", options={"xatol": 0.05}
             )
             band, noise, _ = penalized(best.x)
             spline = BSpline(knots, solveh_banded(band, right[:, part]), SPLINE_DEGREE)
-            self._limit_ends(band, spline, t, noise)
+            self._limit_ends(band, spline, t, noise, largest)
             coefficients[:, part] = solveh_banded(band, right[:, part])
         return BSpline(knots, coefficients, SPLINE_DEGREE)
 
-    def _limit_ends(self, band: Array, spline: BSpline, t: Array, noise: float) -> None:
+    def _limit_ends(
+        self, band: Array, spline: BSpline, t: Array, noise: float, largest: float
+    ) -> None:
         count, margin = SPLINE_DEGREE + 1, SPLINE_DEGREE * self.spacing
         inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
         if not len(inside):
@@ -181,6 +185,8 @@ class PoseSplines:
             basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
             values = np.stack([basis(at, order) for order in _LIMITED_ORDERS])
             limit = values.T @ weight @ values
+            # Constant poses have no derivatives inside; their limit would exceed all poses.
+            limit *= min(1.0, largest / np.trace(limit))
             for k in range(count):
                 band[SPLINE_DEGREE - k, columns][k:] += np.diag(limit, k)
 
