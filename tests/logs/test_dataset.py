@@ -19,6 +19,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
+from drake_teleop.logs.dataset.dataset_files import open_dataset
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
@@ -201,6 +202,15 @@ def test_a_killed_run_continues_to_the_same_bytes(
     for files in (whole, resumed):
         files.pop("summary.json"), files.pop("report.html")  # contain the name of the folder
     assert whole == resumed
+
+
+def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        episodes = write_sample_dataset(tmp_path / "demo", episodes=2, seed=seed)
+        dataset = open_dataset(tmp_path / "demo")
+        for episode, made in zip(dataset.episodes, episodes, strict=True):
+            read = dataset.read_episode(episode).raw("observation.wrench[2]", "test")[:, 0]
+            np.testing.assert_allclose(read, made.wrench[:, 2], atol=1e-5)
 
 
 STATE = {
