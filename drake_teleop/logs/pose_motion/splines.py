@@ -24,8 +24,9 @@ GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
-_LIMITED_ORDERS = range(1, 5)  # of derivatives at the ends
-_MAX_WEIGHT_RATIO = 1e12  # weight of penalty and limits over that of the poses, for rounding
+_LIMITED_DERIVATIVES = range(1, 5)  # of derivatives at the ends
+# Largest weight of the penalty or of a limit over that of the poses; rounding allows no more.
+_MAX_WEIGHT_RATIO = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class PoseSplines:
     """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
     Args:
-        smooth: penalize the fifth derivative, with the weight of largest marginal likelihood, and
+        smooth: penalize the fifth derivative, by the weight of largest likelihood, Eq. (T84), and
             expect derivatives at the ends as large as inside, with the same correlations.
     """
 
@@ -113,7 +114,7 @@ class PoseSplines:
         )
         if imu_rows is None:
             if self._smooth:
-                return self._fit_smooth(t, knots, gram, right)
+                return self._fit_smooth_spline(t, knots, gram, right)
             return BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
         columns = []
         shifted_t = imu_rows.t - self._start
@@ -136,19 +137,19 @@ class PoseSplines:
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), SPLINE_DEGREE)
 
-    def _fit_smooth(self, t: Array, knots: Array, gram: Array, right: Array) -> BSpline:
+    def _fit_smooth_spline(self, t: Array, knots: Array, gram: Array, right: Array) -> BSpline:
         values = np.hstack([self.poses.position, self.poses.quaternion])
         A = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
         root = diags_array(np.sqrt(np.diff(knots[SPLINE_DEGREE:-SPLINE_DEGREE])))
         root = root @ _derivative_map(knots, SPLINE_DEGREE)
-        penalty = _band((root.T @ root).tocsr())
+        penalty = _upper_band((root.T @ root).tocsr())
         largest = _MAX_WEIGHT_RATIO * gram[-1].max()
         lowest = (self.rate * penalty[-1].max() / largest) ** (0.5 / SPLINE_DEGREE) / (2 * np.pi)
         coefficients = np.empty_like(right)
         for part in (slice(0, 3), slice(3, 7)):
 
             def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
-                """Return band and noise variance of a weight, and the cost -2 log likelihood."""
+                """Return normal matrix, noise variance and -2 log likelihood for a cutoff."""
                 weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)
@@ -165,25 +166,25 @@ class PoseSplines:
             )
             band, noise, _ = penalized(best.x)
             spline = BSpline(knots, solveh_banded(band, right[:, part]), SPLINE_DEGREE)
-            self._limit_ends(band, spline, t, noise, largest)
+            self._limit_derivatives_at_ends(band, spline, t, noise, largest)
             coefficients[:, part] = solveh_banded(band, right[:, part])
         return BSpline(knots, coefficients, SPLINE_DEGREE)
 
-    def _limit_ends(
+    def _limit_derivatives_at_ends(
         self, band: Array, spline: BSpline, t: Array, noise: float, largest: float
     ) -> None:
         count, margin = SPLINE_DEGREE + 1, SPLINE_DEGREE * self.spacing
         inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
         if not len(inside):
             return
-        x = np.stack([spline(inside, order) for order in _LIMITED_ORDERS])
+        x = np.stack([spline(inside, order) for order in _LIMITED_DERIVATIVES])
         covariance = np.einsum("inc,jnc->ij", x, x) / (x.shape[1] * x.shape[2])
         std = np.sqrt(np.diag(covariance)) + 1e-150
         correlation = covariance / np.outer(std, std) + 1e-6 * np.eye(len(std))
         weight = noise * np.linalg.inv(correlation) / np.outer(std, std)
         for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
             basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
-            values = np.stack([basis(at, order) for order in _LIMITED_ORDERS])
+            values = np.stack([basis(at, order) for order in _LIMITED_DERIVATIVES])
             limit = values.T @ weight @ values
             # Constant poses have no derivatives inside; their limit would exceed all poses.
             limit *= min(1.0, largest / np.trace(limit))
@@ -355,7 +356,7 @@ def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> 
         [band[degree - k, k:] for k in range(degree + 1)], offsets=list(range(degree + 1))
     ).tocsr()
     gram = change.T @ (upper + upper.T - diags_array(band[degree])) @ change
-    return _band(gram.tocsr()), change.T @ right
+    return _upper_band(gram.tocsr()), change.T @ right
 
 
 def _derivative_map(knots: Array, order: int) -> csr_array:
@@ -370,7 +371,7 @@ def _derivative_map(knots: Array, order: int) -> csr_array:
     return change
 
 
-def _band(gram: csr_array) -> Array:
+def _upper_band(gram: csr_array) -> Array:
     out = np.zeros((SPLINE_DEGREE + 1, gram.shape[0]))
     for k in range(SPLINE_DEGREE + 1):
         out[SPLINE_DEGREE - k, k:] = gram.diagonal(k)
