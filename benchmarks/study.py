@@ -109,8 +109,8 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 def sharded(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
     """One process, and beside it shards one after another: three are killed and submitted again."""
     study, warm, found = folder / "study.yaml", folder / "warm.yaml", folder / "shards.json"
-    study.write_text(_STUDY.format(sigmas=arguments.runs // 4, gammas=2, repeats=2))
-    warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=2))
+    study.write_text(_STUDY.format(sigmas=arguments.runs // 8, gammas=2, repeats=4))
+    warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=4))
     run(warm, folder / "warm", "--jobs", "1")
     words = [sys.executable, __file__, "--runs", str(arguments.runs)]
     words += ["--shards", str(arguments.shards), "--shards-in", str(folder)]
