@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MEMORY_SIZE = 180  #: length of the memory vector of one end
+MEMORY_SIZE = 200  #: length of the memory vector of one end
 NUM_PARAMETERS = 26  #: length of the parameter vector, which `method_parameters` fills
 
 
