@@ -20,6 +20,7 @@ from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
     DRAG,
+    ENCODER_STEP,
     IN_CONTACT,
     INITIAL,
     LEDGER_LEVEL,
@@ -93,7 +94,7 @@ _HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_SPEED = 0.02  # m/s
 _HAND_REST_S = 0.1
 _DRAG_FADE = 0.25
-_FLICKER = (6e-5, 1e-3)  # m, rad
+_LOST_MOTION_STEPS = 1.1  # of the encoders
 _LOW_LEVEL, _FULL_LEVEL = 1.0 - SHARED_RESERVE, 1.0 - 1e-9  # of a reserve, the latter for rounding
 _BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
@@ -145,6 +146,13 @@ class LedgerConfig:
     touch: list[float] = quantity(
         [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
     )
+    encoder_step: list[float] | None = quantity(
+        None,
+        "m, rad",
+        0.0,
+        0.1,
+        "step of the hand's measured pose; null: that of the station's device, 0 without one",
+    )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
@@ -154,6 +162,7 @@ class LedgerConfig:
         )
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
         p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
+        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[MOTION_SCALE])
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
 
 
@@ -224,7 +233,7 @@ def _remove_encoder_flicker(dx, p, memory):
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             lost[i] += dx[i]
-        size, width = length_of_group(lost, g), _FLICKER[g] * p[MOTION_SCALE][g]
+        size, width = length_of_group(lost, g), _LOST_MOTION_STEPS * p[ENCODER_STEP][g]
         share = 1.0 - width / size if size > width else 0.0
         for i in range(3 * g, 3 * g + 3):
             steady[i] = share * lost[i]

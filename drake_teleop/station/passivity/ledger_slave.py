@@ -89,7 +89,7 @@ NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 # Parameters, in the master's power units.
 _layout = own_parameters()
 INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-DRAG, CONTACT_THRESHOLD = _layout.vector(2), _layout.vector(2)
+DRAG, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = own_memory()

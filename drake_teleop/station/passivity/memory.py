@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MEMORY_SIZE = 200  #: length of the memory vector of one end
-NUM_PARAMETERS = 26  #: length of the parameter vector, which `method_parameters` fills
+NUM_PARAMETERS = 28  #: length of the parameter vector, which `method_parameters` fills
 
 
 class SlotAllocator:
