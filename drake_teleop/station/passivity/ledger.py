@@ -364,7 +364,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
         limit_group(far, g, cone[g] * size)
         limit_group(near, g, cone[g] * force)
         for i in range(3 * g, 3 * g + 3):
-            across = T * memory[OWN_VELOCITY][i]
+            across = dx[i] - step * max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_normal_component(wrench, p, memory)
     for g in range(2):
