@@ -322,7 +322,7 @@ def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
     assert got <= 0.0
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2, 4])
+@pytest.mark.parametrize("axis", [0, 2, 4])
 def test_hand_at_the_border_of_two_encoder_steps_receives_a_constant_force(axis):
     """Reading of one step to and fro, for a hand that rests or has moved before, either way."""
     step = 5.5e-5 if axis < 3 else 2e-4  # one step in a millisecond is no fast hand
