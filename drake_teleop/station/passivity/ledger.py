@@ -48,6 +48,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     HELD_WRENCH,
     MOTION_SCALE,
+    RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
     own_memory,
@@ -220,7 +221,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         packet[ENERGY][g], packet[LEDGER_LEVEL][g] = (
             memory[SENT_ENERGY][g],
-            memory[STORED_ENERGY][g],
+            memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g],
         )
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
