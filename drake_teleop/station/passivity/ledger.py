@@ -66,6 +66,7 @@ from drake_teleop.station.passivity.packet import (
     has_arrived,
     length_of_group,
     limit_group,
+    move_pose_into,
     pose_difference_into,
     scale_group,
 )
@@ -225,6 +226,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         )
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
+    for i in range(6):
+        steady[i] = -memory[_LOST_MOTION][i]
+    move_pose_into(packet[POSE], steady, packet[POSE])
     packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
 
 
