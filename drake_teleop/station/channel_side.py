@@ -58,7 +58,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_wrench_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _adapt_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             _contact_force_scale(scenario),
@@ -84,10 +84,15 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_wrench_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _adapt_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
+    ledger = passivity.ledger
+    if ledger.encoder_step is None:
+        steps = scenario.master.encoder_steps()
+        ledger = dataclasses.replace(ledger, encoder_step=[float(steps[0]), float(steps[3])])
     return dataclasses.replace(
         passivity,
+        ledger=ledger,
         force_limit=min(passivity.force_limit, device.peak_force),
         torque_limit=min(passivity.torque_limit, float(device.peak_torque.min())),
     )

@@ -5,6 +5,8 @@ Both ends are stepped by themselves, with packets that are written here.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -63,8 +65,9 @@ RICH = PassivityConfig(
 class Hand:
     """Master's end with its last received packet."""
 
-    def __init__(self, wrench: np.ndarray, stiffness: float) -> None:
-        self.p = method_parameters(RICH)
+    def __init__(self, wrench: np.ndarray, stiffness: float, **own: list[float]) -> None:
+        ledger = dataclasses.replace(RICH.ledger, **own)
+        self.p = method_parameters(dataclasses.replace(RICH, ledger=ledger))
         self.memory = initial_method_memory("ledger", self.p, START)
         self.memory[STORED_ENERGY] = 0.2  # more than it needs, and no more than it keeps in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
@@ -317,6 +320,38 @@ def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
         hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
         assert hand.memory[STORED_ENERGY][0] == pytest.approx(-got)
     assert got <= 0.0
+
+
+@pytest.mark.parametrize("axis", [0, 2, 4])
+def test_hand_at_the_border_of_two_encoder_steps_receives_a_constant_force(axis):
+    """Reading of one step to and fro, for a hand that rests or has moved before, either way."""
+    step = 5.5e-5 if axis < 3 else 2e-4  # one step in a millisecond is no fast hand
+    changes = {}
+    for known in (step, 0.0):
+        steps = [known, 0.0] if axis < 3 else [0.0, known]
+        hand = Hand(np.array([0.4, 0.0, 3.0, 0.0, 0.02, 0.0]), 800.0, encoder_step=steps)
+        hand.rest(1500)
+        for way in (0.0, 7.0, -4.0):
+            dx = np.zeros(6)
+            dx[axis] = way * step
+            hand.step(dx)
+            dx[axis] = step
+            felt = [hand.step(dx * (-1.0) ** k)[axis] for k in range(200)]
+            changes.setdefault(known, []).append(np.abs(np.diff(felt[100:], 2)).max())
+    assert max(changes[step]) < 0.02 * min(changes[0.0])
+
+
+def test_lost_motion_of_the_encoder_is_its_step_and_no_more():
+    """A hand that moves on receives the force of its pose but for 1.1 steps of lost motion."""
+    forces = []
+    for step in (0.0, 5e-5):
+        hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 800.0, encoder_step=[step, 0.0])
+        hand.rest(1500)
+        for _ in range(20):
+            hand.step([0.0, 0.0, -5e-5, 0.0, 0.0, 0.0])
+        forces.append(hand.rest(50)[2])
+    assert forces[0] - forces[1] == pytest.approx(1.1 * 5e-5 * 800.0, rel=0.02)
+    assert forces[0] - 3.0 == pytest.approx(20 * 5e-5 * 800.0, rel=0.02)
 
 
 def test_wrench_cross_fades_after_missing_packets():

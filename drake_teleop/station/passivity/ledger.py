@@ -20,6 +20,7 @@ from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
     DRAG,
+    ENCODER_STEP,
     IN_CONTACT,
     INITIAL,
     LEDGER_LEVEL,
@@ -47,6 +48,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     HELD_WRENCH,
     MOTION_SCALE,
+    RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
     own_memory,
@@ -64,6 +66,7 @@ from drake_teleop.station.passivity.packet import (
     has_arrived,
     length_of_group,
     limit_group,
+    move_pose_into,
     pose_difference_into,
     scale_group,
 )
@@ -88,10 +91,12 @@ _FORWARDING_LEVEL = 0.5  # of the master's reserve
 _MIN_RESERVE_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
 _RELEASE_DISTANCE_M = 0.03
-_WRENCH_RECOVERY_S = 0.1
+_WRENCH_RECOVERY_S = 1.0
 _HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_SPEED = 0.02  # m/s
 _HAND_REST_S = 0.1
+_DRAG_FADE = 0.25
+_LOST_MOTION_STEPS = 1.1  # of the encoders
 _LOW_LEVEL, _FULL_LEVEL = 1.0 - SHARED_RESERVE, 1.0 - 1e-9  # of a reserve, the latter for rounding
 _BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
@@ -110,6 +115,7 @@ _LAST_SLAVE_POSE, _SLAVE_STEP = _layout.vector(7), _layout.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
 _WORK_ON_HAND, _WITHHELD_SHARE = _layout.vector(2), _layout.vector(2)
 _DRAG_ACTIVE = _layout.vector(2)
+_LOST_MOTION, _STEADY_STEP = _layout.vector(6), _layout.vector(6)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
 _NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _layout.number(), _layout.vector(2), _layout.vector(6)
 
@@ -142,6 +148,13 @@ class LedgerConfig:
     touch: list[float] = quantity(
         [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
     )
+    encoder_step: list[float] | None = quantity(
+        None,
+        "m, rad",
+        0.0,
+        0.1,
+        "step of the hand's measured pose; null: that of the station's device, 0 without one",
+    )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
@@ -151,6 +164,7 @@ class LedgerConfig:
         )
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
         p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
+        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[MOTION_SCALE])
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
 
 
@@ -172,8 +186,12 @@ def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
-    filter_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
-    memory[_WALL_DEPTH] += work_along(memory[_WALL_DIRECTION], dx)
+    _remove_encoder_flicker(dx, p, memory)
+    steady = memory[_STEADY_STEP]
+    for i in range(6):
+        offset_to_slave[i] = steady[i] / T
+    filter_velocity(offset_to_slave, min(T / _VELOCITY_FILTER_S, 1.0), memory)
+    memory[_WALL_DEPTH] += work_along(memory[_WALL_DIRECTION], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
@@ -181,7 +199,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     offset_to_slave[:] = 0.0
     if has_arrived(received):
         pose_difference_into(pose, received[POSE], offset_to_slave)
-    _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench)
+        for i in range(6):
+            offset_to_slave[i] -= memory[_LOST_MOTION][i]
+    _predict_contact(received, steady, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
         wrench[i] += received[PACKET_LOAD_WRENCH][i]
     newest = received[PACKET_NUMBER]
@@ -202,11 +222,27 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         packet[ENERGY][g], packet[LEDGER_LEVEL][g] = (
             memory[SENT_ENERGY][g],
-            memory[STORED_ENERGY][g],
+            memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g],
         )
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
+    for i in range(6):
+        steady[i] = -memory[_LOST_MOTION][i]
+    move_pose_into(packet[POSE], steady, packet[POSE])
     packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
+
+
+@njit(cache=True)
+def _remove_encoder_flicker(dx, p, memory):
+    lost, steady = memory[_LOST_MOTION], memory[_STEADY_STEP]
+    for g in range(2):
+        for i in range(3 * g, 3 * g + 3):
+            lost[i] += dx[i]
+        size, width = length_of_group(lost, g), _LOST_MOTION_STEPS * p[ENCODER_STEP][g]
+        share = 1.0 - width / size if size > width else 0.0
+        for i in range(3 * g, 3 * g + 3):
+            steady[i] = share * lost[i]
+            lost[i] -= steady[i]
 
 
 @njit(cache=True)
@@ -416,6 +452,8 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
         active[g] = 0.0
     if active[g] > 0.0:
         drag = p[DRAG][g]
+        if in_contact:
+            drag *= min((1.0 - master_level) / _DRAG_FADE, 1.0)
     if speed < _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g]:
         memory[_WORK_ON_HAND][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND][g] > 0.0:

@@ -61,7 +61,7 @@ _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
 _ENERGY_CAPACITY = 4.0  # over the reserve
 _SLAVE_FILTER_S = 3e-3
 _REST_SPEED = 0.05  # m/s
-_REST_SEND_RATE, _SEND_RATE = 5.0, 50.0  # 1/s
+_REST_SEND_RATE, _SEND_RATE = 20.0, 50.0  # 1/s
 _MAXIMA_DECAY_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
 _PRESSING_SPEED = 0.06  # m/s
@@ -89,7 +89,7 @@ NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 # Parameters, in the master's power units.
 _layout = own_parameters()
 INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-DRAG, CONTACT_THRESHOLD = _layout.vector(2), _layout.vector(2)
+DRAG, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = own_memory()
@@ -238,7 +238,7 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     kinetic = 0.5 * MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
-    free, missing, returned = ledger[g] - kinetic, hold - received[LEDGER_LEVEL][g], 0.0
+    free, missing, returned = ledger[g] - kinetic, hold - _master_level(g, received, memory), 0.0
     needed = missing
     if in_contact and speed < _REST_SPEED * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - SHARED_RESERVE) * reserve, _REST_SEND_RATE
@@ -251,6 +251,12 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     memory[DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
     memory[_BALANCE][g] = ledger[g] - kinetic
+
+
+@njit(cache=True)
+def _master_level(g, received, memory):
+    """Return the level of the master's ledger [J], with what is in transit to it."""
+    return received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
 
 
 @njit(cache=True)
@@ -268,7 +274,7 @@ def _max_displayed_stiffness(received, T, p, memory):
             p[MASTER_RESERVE][g],
         )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
-        level = min(max(received[LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
+        level = min(max(_master_level(g, received, memory) / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
         _MAX_FEEDFORWARD_SILENCE_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-MEMORY_SIZE = 180  #: length of the memory vector of one end
-NUM_PARAMETERS = 26  #: length of the parameter vector, which `method_parameters` fills
+MEMORY_SIZE = 200  #: length of the memory vector of one end
+NUM_PARAMETERS = 28  #: length of the parameter vector, which `method_parameters` fills
 
 
 class SlotAllocator:
