@@ -40,7 +40,7 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.oscillation import high_pass
-from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
 from drake_teleop.station.simulation import (
@@ -213,7 +213,7 @@ def _run_one_dof_study(
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
-        steps_of(method)
+        step_addresses(method)
     seeds = range(seed, seed + 2)
     found = _run_parallel(
         longest_round_trip,

@@ -210,8 +210,8 @@ def run_one_dof(
     # command over it.
     held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
     rows = _simulate_steps(
-        methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
-        ends, start, timeout, np.concatenate(course, axis=1),
+        methods.step_addresses(passivity.method), tuple(map(float, numbers)), held, p, *lines,
+        *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD
     master, slave, command, felt, pushed = rows.T[:5]

@@ -61,7 +61,7 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         frame = np.concatenate([rotation.ravel(), scales])
-        self._method = methods.steps_of(passivity.method)
+        self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, frame, parameters
         ends = initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.

@@ -40,7 +40,7 @@ from drake_teleop.station.passivity.packet import (
 )
 from drake_teleop.station.passivity.safe_state import (
     MASTER_MONITOR_SIZE,
-    SILENCE_S,
+    SILENCE_TIME,
     SLAVE_MONITOR_SIZE,
     STOP_TIME_S,
     initial_master_monitor,
@@ -199,8 +199,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_S]
-    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_S]
+    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -375,7 +375,7 @@ class TeleopChannel(LeafSystem):
             for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
-        self._steps = methods.steps_of(passivity.method)
+        self._steps = methods.step_addresses(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
         self._constants = (
             *(

@@ -35,7 +35,7 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 
 
 @njit(cache=True)
-def remove_slip_steps(displayed, component, explained, share, max_slip):
+def force_without_slip_steps(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
     `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
