@@ -34,7 +34,7 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import Master, data_sheet_of
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import check_task
+from drake_teleop.station.operator.task import check_distance
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
@@ -290,7 +290,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 def _check_task(scenario: Scenario, where: str) -> None:
     if scenario.operator.task is None:
         return
-    check_task(scenario.operator.task, f"{where}:operator.task")
+    check_distance(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
             "the scale is 0, but the operator's task requires motion of the slave (above 0)",

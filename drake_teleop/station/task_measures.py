@@ -19,7 +19,7 @@ from drake_teleop.station.operator.decision import (
     PHASE_STOPPING,
     PHASE_WAITING,
 )
-from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Task, Touch
+from drake_teleop.station.operator.task import TASK_MEASURE_NAMES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -80,7 +80,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         "detection_time_s": detection_time(t[span], touching, noticed),
         "false_notices": float(_count_false_detections(touching, noticed)),
     }
-    return {name: figures[name] for name in TASK_MEASURES}
+    return {name: figures[name] for name in TASK_MEASURE_NAMES}
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:

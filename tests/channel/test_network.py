@@ -294,7 +294,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
     monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
     for k in range(100, 120):
-        network._advance_loss_chain.py_func(p, k, 0.0)
+        network._draw_loss_and_delays.py_func(p, k, 0.0)
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]

@@ -23,18 +23,18 @@ from drake_teleop.station.sensor.motion_estimation import (
     estimate_sample_into,
     estimated_motion_std,
     fusion_filters,
-    motion_estimator,
+    initialize_motion_estimator,
     path_delays,
     steady_state_kalman_filter,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
@@ -84,11 +84,11 @@ def sampled(
     """Return samples of sensor and estimation; `believed` is the nominal sensor."""
     n = truth.shape[1] - 15
     noise = np.random.default_rng(seed).standard_normal(
-        (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE)
+        (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE)
     )
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
-    chain, chain_memory = sensor_chain_constants(sensor, n, T)
-    constants, memory = motion_estimator(config, believed or sensor, n, T)
+    chain, chain_memory = initialize_sensor_chain(sensor, n, T)
+    constants, memory = initialize_motion_estimator(config, believed or sensor, n, T)
     for k in range(len(truth)):
         read_sensor_into(
             chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
@@ -403,7 +403,7 @@ def test_the_offset_of_an_accelerometer_is_found(fast):
 
 def test_flag_stays_while_part_of_the_reading_is_delayed():
     sensor = dataclasses.replace(QUIET, acceleration_latency=1e-3)
-    constants, memory = motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
+    constants, memory = initialize_motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
     reading, sample, flags = np.zeros(19), np.zeros(22), []
     reading[13:] = home()
     for k in range(40):
@@ -415,4 +415,4 @@ def test_flag_stays_while_part_of_the_reading_is_delayed():
 
 def test_bandwidth_above_the_rate_is_rejected():
     with pytest.raises(DrakeTeleopError, match="encoder_bandwidth_hz"):
-        motion_estimator(MotionEstimationConfig("encoders", 500.0), JR3, 6, 1e-3)
+        initialize_motion_estimator(MotionEstimationConfig("encoders", 500.0), JR3, 6, 1e-3)

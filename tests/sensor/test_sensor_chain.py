@@ -20,16 +20,16 @@ from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.sensor.presets import PRESETS, preset_of_block
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     OFFSET_CONSTANTS,
     PARTS,
     PRESET_NAMES,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     calibration_matrices,
+    initialize_sensor_chain,
     is_plausible,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 
@@ -48,13 +48,13 @@ UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
 
 
 def readings(config, truths, noise=None, period=PERIOD):
-    """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
+    """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_BLOCK_SIZE)."""
     blocks = (
-        np.zeros((-(-len(truths) // SAMPLES_PER_NOISE_BLOCK), NOISE_SIZE))
+        np.zeros((-(-len(truths) // SAMPLES_PER_NOISE_BLOCK), NOISE_BLOCK_SIZE))
         if noise is None
         else noise
     )
-    constants, memory = sensor_chain_constants(config, truths.shape[1] - 15, period)
+    constants, memory = initialize_sensor_chain(config, truths.shape[1] - 15, period)
     out = np.empty((len(truths), truths.shape[1] - 2))
     for k, truth in enumerate(truths):
         read_sensor_into(constants, memory, blocks[k // SAMPLES_PER_NOISE_BLOCK], truth, out[k])
@@ -72,7 +72,7 @@ def random_truths(count, seed=0, joints=JOINTS):
 
 def random_noise(count, seed=1):
     blocks = -(-count // SAMPLES_PER_NOISE_BLOCK)
-    return np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
+    return np.random.default_rng(seed).standard_normal((blocks, NOISE_BLOCK_SIZE))
 
 
 def as_read(truths):
@@ -246,10 +246,10 @@ def test_offset_drifts_and_may_change_during_a_run():
     expected += np.array([*offset, *bias])
     np.testing.assert_allclose(error, expected, atol=1e-12)
 
-    constants, memory = sensor_chain_constants(part(offset=offset), JOINTS, PERIOD)
+    constants, memory = initialize_sensor_chain(part(offset=offset), JOINTS, PERIOD)
     constants[OFFSET_CONSTANTS] += 5.0
     reading = np.empty(13 + JOINTS)
-    read_sensor_into(constants, memory, np.zeros(NOISE_SIZE), truths[0], reading)
+    read_sensor_into(constants, memory, np.zeros(NOISE_BLOCK_SIZE), truths[0], reading)
     np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
 
 
@@ -291,7 +291,7 @@ def test_the_offset_counts_in_the_saturation(low_pass):
 
 
 def test_overload_including_offset_is_not_plausible():
-    constants, _ = sensor_chain_constants(part(saturates=True), JOINTS, PERIOD)
+    constants, _ = initialize_sensor_chain(part(saturates=True), JOINTS, PERIOD)
     truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
     assert is_plausible(constants, truth)
     truth[0] = 0.99 * largest

@@ -29,13 +29,13 @@ from drake_teleop.common.vectors import (
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import OperatorTraining
-from drake_teleop.station.operator.minimum_jerk import add_plan_into
+from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into
 from drake_teleop.station.operator.perception import Perception, update_perception_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
-_MAX_TORQUE_NM = 2.0  # N m, estimate
+_MAX_HAND_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
+_MAX_HAND_TORQUE_NM = 2.0  # N m, estimate
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 
 @njit(cache=True)
-def unit_pose_into(pose, twist, out):
+def normalize_pose_into(pose, twist, out):
     """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
@@ -213,8 +213,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit_vector_length(wrench[:3], _MAX_FORCE_N)
-    _limit_vector_length(wrench[3:], _MAX_TORQUE_NM)
+    _limit_vector_length(wrench[:3], _MAX_HAND_FORCE_N)
+    _limit_vector_length(wrench[3:], _MAX_HAND_TORQUE_NM)
 
 
 @njit(cache=True)
@@ -223,7 +223,7 @@ def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, 
     for k in range(6):
         twist[k] += moving[k]
     if memory.shape[0] > 0:
-        add_plan_into(memory, time, pose, twist)
+        add_planned_motion_into(memory, time, pose, twist)
 
 
 @njit(cache=True, borrows=True)
@@ -397,7 +397,7 @@ class Operator(LeafSystem):
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not unit_pose_into(pose, twist, self._commanded_pose):
+        if not normalize_pose_into(pose, twist, self._commanded_pose):
             raise DrakeTeleopError(
                 f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
                 where="intended_pose",

@@ -74,7 +74,7 @@ KIND_REACH, KIND_TOUCH, KIND_PRESS, KIND_INSERT = range(4)
 TASK_CLASSES = (Reach, Touch, Press, Insert)
 
 #: Names of the measures that `station.task_measures` defines.
-TASK_MEASURES = (
+TASK_MEASURE_NAMES = (
     "success",
     "task_time_s",
     "contact_force_overshoot_N",
@@ -104,7 +104,7 @@ class Movement:
     gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 
 
-def check_task(task: Task, where: str) -> None:
+def check_distance(task: Task, where: str) -> None:
     """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:

@@ -49,29 +49,29 @@ from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, GRAVITY_COLUMN, sen
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
-_RMS_LEVER_M = 0.4
+_RMS_LEVER_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
 # accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAITS = 0, 1, 2, 3
+_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAIT_SAMPLES = 0, 1, 2, 3
 _ACCELEROMETER_POSITION = 6  # (3,)
 _ACCELEROMETER_AXES = _ACCELEROMETER_POSITION + 3  # (3, 3)
 _ANGLE_LOW_PASSES = _ACCELEROMETER_AXES + 9  # (4, 5) the sensor's and those of `encoders`
-_NUM_FILTER_SECTIONS = 4
-_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_FILTER_SECTIONS
+_NUM_ANGLE_SECTIONS = 4
+_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_ANGLE_SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_FLAG_SAMPLES_LEFT = 1
+_FLAGGED_SAMPLES_LEFT = 1
 _ANGULAR_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FUSION_FILTER_SIZE
-_KINEMATICS_SCRATCH = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_START = _KINEMATICS_SCRATCH + FRAME_STATE_SIZE
-_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_FILTER_SECTIONS
+_KINEMATICS_SCRATCH_START = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
+_JOINT_START = _KINEMATICS_SCRATCH_START + FRAME_STATE_SIZE
+_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
 @settings
@@ -159,7 +159,7 @@ def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
     wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _group_delay_samples(_low_pass_filters_of_paths(config, sensor, period)) * period
+    encoders += _group_delay_samples(_angle_low_pass_sections(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -175,7 +175,7 @@ def fusion_filters(
     return (
         steady_state_kalman_filter(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_filter(
-            angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period
+            angle_std * _RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
         ),
     )
 
@@ -190,14 +190,14 @@ def estimated_motion_std(
     shift = np.exp(-1j * np.pi * (np.arange(1 << 14) + 0.5) / (1 << 14))
     response = [
         np.polyval([b2, b1, b0], shift) / np.polyval([a2, a1, 1.0], shift)
-        for b0, b1, b2, a1, a2 in _low_pass_filters_of_paths(config, sensor, period)
+        for b0, b1, b2, a1, a2 in _angle_low_pass_sections(config, sensor, period)
     ]
     differenced = np.polyval([-1.0, 4.0, -5.0, 2.0], shift) / period**2
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _encoder_angle_std(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _RMS_LEVER_M, 0.0, alpha], 3)
+    return np.repeat([alpha * _RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
 
 
 def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
@@ -218,7 +218,7 @@ def _accelerometer_std(
     return np.sqrt(s_std**2 + crossed), alpha_std
 
 
-def motion_estimator(
+def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `estimate_sample_into`."""
@@ -237,7 +237,7 @@ def motion_estimator(
             waits,
             p_SoAo_S,
             R_SA.ravel(),
-            _low_pass_filters_of_paths(config, sensor, period).ravel(),
+            _angle_low_pass_sections(config, sensor, period).ravel(),
             angular.gains,
             linear.gains,
         ]
@@ -248,10 +248,10 @@ def motion_estimator(
     )
 
 
-def _low_pass_filters_of_paths(
+def _angle_low_pass_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    filters = np.zeros((_NUM_FILTER_SECTIONS, 5))
+    filters = np.zeros((_NUM_ANGLE_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
         filters[:2] = butterworth_sections(sensor.bandwidth_hz, 1 / period)
@@ -277,12 +277,12 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     """Convert one reading of the sensor per period to a sample whose values have the same instant.
 
     Args:
-        constants, memory: results of `motion_estimator`; memory is updated.
+        constants, memory: results of `initialize_motion_estimator`; memory is updated.
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
     joints = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n]
     angles = sample[SAMPLE_JOINT_POSITION]
     _align_signal_paths(constants, memory, n, reading, sample)
@@ -305,7 +305,7 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
     _align_signal_paths(constants, memory, n, reading, sample)
     copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
@@ -336,21 +336,21 @@ def _delay_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
-    wrench = int(constants[_PATH_WAITS]) * width
-    acceleration = int(constants[_PATH_WAITS + 1]) * width
+    wrench = int(constants[_PATH_WAIT_SAMPLES]) * width
+    acceleration = int(constants[_PATH_WAIT_SAMPLES + 1]) * width
     waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_PATH_WAITS + 2])
-    older = constants[_PATH_WAITS + 2] - wait
+    wait = int(constants[_PATH_WAIT_SAMPLES + 2])
+    older = constants[_PATH_WAIT_SAMPLES + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES_LEFT] - 1.0
-    memory[_FLAG_SAMPLES_LEFT] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES_LEFT] > 0.0 else 0.0
+    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT] - 1.0
+    memory[_FLAGGED_SAMPLES_LEFT] = max(flagged, 0.0)
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -384,13 +384,13 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
     angular, linear = (
         memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START],
-        memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH],
+        memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH_START],
     )
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)
             copy_into(angular, 15, R, 0, 9)
-        _rotation_vector_into(angular[15:], R, motion)
+        _rotation_between_into(angular[15:], R, motion)
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
@@ -422,7 +422,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
 
 @njit(cache=True)
-def _rotation_vector_into(before, R, angle):
+def _rotation_between_into(before, R, angle):
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0

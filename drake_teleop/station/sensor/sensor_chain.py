@@ -42,7 +42,7 @@ from drake_teleop.load.regressor import (
 SAMPLES_PER_NOISE_BLOCK = 128
 _NUM_CHANNELS = 12
 #: Standard normal numbers of a block: 12 for each sample, then 12 for the random walks.
-NOISE_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
+NOISE_BLOCK_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
 LOST_FLAG_SAMPLES = 40
@@ -231,7 +231,7 @@ _CALIBRATION_FIELDS = (
     *("gain_error", "cross_talk", "misalignment"),
     *("acceleration_gain_error", "acceleration_misalignment"),
 )
-_QUANTITY_NAMES = ("force", "torque", "acceleration", "angular_acceleration")
+_NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
@@ -240,8 +240,8 @@ PARTS: dict[str, dict[str, Any]] = {
         "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     },
     "low_pass": {"low_pass": "none"},
-    "noise": {f"{name}_noise": 0.0 for name in _QUANTITY_NAMES},
-    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITY_NAMES},
+    "noise": {f"{name}_noise": 0.0 for name in _NOISY_QUANTITIES},
+    "random_walk": {f"{name}_walk": 0.0 for name in _NOISY_QUANTITIES},
     "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
     "drift": {"drift": [0.0] * 6},
     "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},
@@ -293,12 +293,12 @@ def calibration_matrices(
     wrench = config.cross_talk * talk * ranges[:, None] / ranges
     np.fill_diagonal(wrench, 1 + config.gain_error * gains)
     scales = 1 + config.acceleration_gain_error * acceleration_gains
-    turned = _rotation_matrix(acceleration_axis, config.acceleration_misalignment)
-    both = np.kron(np.eye(2), _rotation_matrix(axis, config.misalignment))
+    turned = _rotation_about_axis(acceleration_axis, config.acceleration_misalignment)
+    both = np.kron(np.eye(2), _rotation_about_axis(axis, config.misalignment))
     return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
 
 
-def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
@@ -317,9 +317,9 @@ _MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s
 _ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
 _LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
 _LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
-_PATH_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER_STEP = _PATH_LATENCIES + 3
-_IS_IDEAL = _ENCODER_STEP + 1
+_PATH_LATENCY_SAMPLES = _LOW_PASS_STAGE + 1  # (3,)
+_ENCODER_QUANTUM = _PATH_LATENCY_SAMPLES + 3
+_IS_IDEAL = _ENCODER_QUANTUM + 1
 _OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
 _BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
@@ -327,10 +327,10 @@ _BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 _RANDOM_WALK_START = 1
 FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_CHANNELS
 _DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
-_DELAY_LINE_ROW = _NUM_CHANNELS + 2
+_DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 
-def sensor_chain_constants(
+def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
@@ -369,7 +369,7 @@ def sensor_chain_constants(
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW + num_joints))
+    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
 
 
 @njit(cache=True)
@@ -388,8 +388,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     """Convert true values to the sensor's reading at one instant, once per period.
 
     Args:
-        constants, memory: results of `sensor_chain_constants`; memory is updated.
-        noise: (NOISE_SIZE,) standard normal numbers for this block of samples.
+        constants, memory: results of `initialize_sensor_chain`; memory is updated.
+        noise: (NOISE_BLOCK_SIZE,) standard normal numbers for this block of samples.
         truth: (15 + n,) [wrench (6) of the sensor on the tool at So in S | specific force of So
             (3), angular velocity (3), angular acceleration (3) in S | joint angles (n)].
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
@@ -404,7 +404,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    width = _DELAY_LINE_ROW + angles.shape[0]
+    width = _DELAY_LINE_ROW_SIZE + angles.shape[0]
     rows = (memory.shape[0] - _DELAY_LINE_START) // width
     shift_delay_line(memory[_DELAY_LINE_START:], width)
     row = memory[_DELAY_LINE_START:][:width]
@@ -430,20 +430,20 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
-    row[_NUM_CHANNELS] = _quantize(constants, 0, 6, channels)
-    row[_NUM_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
+    row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
+    row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER_STEP]
-    for i in range(_DELAY_LINE_ROW, width):
-        angle = angles[i - _DELAY_LINE_ROW]
+    quantum = constants[_ENCODER_QUANTUM]
+    for i in range(_DELAY_LINE_ROW_SIZE, width):
+        angle = angles[i - _DELAY_LINE_ROW_SIZE]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
 
     if count == 0:
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_PATH_LATENCIES:_ENCODER_STEP]
+    late = constants[_PATH_LATENCY_SAMPLES:_ENCODER_QUANTUM]
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -454,8 +454,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     reading[READ_SATURATED] = max(
         memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
     )
-    for i in range(_DELAY_LINE_ROW, width):
-        turned[i - _DELAY_LINE_ROW] = memory[encoders + i]
+    for i in range(_DELAY_LINE_ROW_SIZE, width):
+        turned[i - _DELAY_LINE_ROW_SIZE] = memory[encoders + i]
 
 
 @njit(cache=True)
@@ -481,7 +481,7 @@ def _apply_calibration_errors(constants, truth, out):
 
 
 @njit(cache=True)
-def _quantize(constants, first, end, channels):
+def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = (

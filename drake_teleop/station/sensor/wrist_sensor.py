@@ -55,19 +55,19 @@ from drake_teleop.station.environment.moving_bodies import interpolate_joint_sta
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
-    motion_estimator,
+    initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     FILTER_MEMORY_START,
     LOST_FLAG_SAMPLES,
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
+    initialize_sensor_chain,
     is_plausible,
     read_sensor_into,
-    sensor_chain_constants,
 )
 from drake_teleop.station.slave.arm import (
     FRAME_STATE_SIZE,
@@ -91,14 +91,14 @@ from drake_teleop.station.slave.plant_dynamics import (
 Array = NDArray[np.float64]
 
 #: Tolerance of equal instants, in periods.
-_TIME_TOLERANCE = 1e-6
+_TIME_TOLERANCE_PERIODS = 1e-6
 #: Largest number of queued steps.
 _MAX_QUEUED_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
+_ACCELERATION_CHECK_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
 #: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
-_NO_GIVEN_WRENCH = np.zeros(0)
+_USE_COMPILED_CONTACT = np.zeros(0)
 
 
 @njit(cache=True)
@@ -195,7 +195,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 
 @njit(cache=True)
-def _torque_at_offset_into(held, after, torque):
+def _extrapolate_torque_into(held, after, torque):
     copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -239,7 +239,7 @@ def take_due_samples(
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_plant_state(state, around, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
-    _torque_at_offset_into(held, 0.0, tau)
+    _extrapolate_torque_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
         environment_wrench(
@@ -255,29 +255,29 @@ def take_due_samples(
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
-        if (count + _TIME_TOLERANCE) * period >= until:
+        if (count + _TIME_TOLERANCE_PERIODS) * period >= until:
             continue
-        _torque_at_offset_into(held, start[0] - time, tau)
+        _extrapolate_torque_into(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _torque_at_offset_into(held, until - time, tau)
+            _extrapolate_torque_into(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
-        while (count + _TIME_TOLERANCE) * period < until:
+        while (count + _TIME_TOLERANCE_PERIODS) * period < until:
             u = (count * period - start[0]) / h
             _interpolate_state(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
-            _torque_at_offset_into(held, count * period - time, tau)
+            _extrapolate_torque_into(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
-    taken = (count - 1.0 + _TIME_TOLERANCE) * period > time
+    taken = (count - 1.0 + _TIME_TOLERANCE_PERIODS) * period > time
     copy_into(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _TIME_TOLERANCE) * period < time:
+    if until_now and (count - _TIME_TOLERANCE_PERIODS) * period < time:
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
@@ -298,7 +298,7 @@ class WristSensor(LeafSystem):
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         - contact_results: contact results of the plant (only with surroundings)
-        - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
+        - noise: (NOISE_BLOCK_SIZE,) standard normal numbers (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
@@ -324,8 +324,8 @@ class WristSensor(LeafSystem):
         super().__init__()
         arm = slave.arm
         n = self._n = arm.num_joints
-        constants, chain = sensor_chain_constants(config, n, period)
-        motion_constants, estimator = motion_estimator(motion, config, n, period)
+        constants, chain = initialize_sensor_chain(config, n, period)
+        motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
         self._offset = constants[OFFSET_CONSTANTS]
         self._physics, contact = slave.physics_of_plant, slave.contact
         first = sample_at_rest(arm, q_start)
@@ -349,7 +349,7 @@ class WristSensor(LeafSystem):
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
-        self._no_noise, self._zero_wrench = np.zeros(NOISE_SIZE), np.zeros(6)
+        self._no_noise, self._zero_wrench = np.zeros(NOISE_BLOCK_SIZE), np.zeros(6)
         self._no_rate = np.zeros(0)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
@@ -367,7 +367,7 @@ class WristSensor(LeafSystem):
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = contact.bodies, contact.shapes
         if not config.ideal:
-            self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
+            self._noise = self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._memory_slice = slice(len(first) + 1, None)  # memory in the output
@@ -385,7 +385,7 @@ class WristSensor(LeafSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
-        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD_S, 0.0, self._check_acceleration)
+        self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_S, 0.0, self._check_acceleration)
 
     @property
     def offset(self) -> Array:
@@ -424,7 +424,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         seen = self._arm_state_and_surroundings(context)
         self._take_samples(
-            context, seen, self._contact_proximity(*seen), False, _NO_GIVEN_WRENCH, self._result
+            context, seen, self._tool_proximity(*seen), False, _USE_COMPILED_CONTACT, self._result
         )
         context.SetDiscreteState(self._result[self._memory_slice])
 
@@ -432,7 +432,7 @@ class WristSensor(LeafSystem):
         """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
-        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
+        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE_PERIODS), 0.0
         append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
     def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
@@ -446,7 +446,7 @@ class WristSensor(LeafSystem):
     def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _contact_proximity(self, state: Array, around: Array) -> int:
+    def _tool_proximity(self, state: Array, around: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
         if self._beyond_contact_law:
@@ -466,7 +466,7 @@ class WristSensor(LeafSystem):
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
-    def _evaluate_inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
+    def _sampling_inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
         return (
             self._physics,
             self._sensor,
@@ -484,13 +484,13 @@ class WristSensor(LeafSystem):
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
         seen = self._arm_state_and_surroundings(context)
-        near = self._contact_proximity(*seen)
+        near = self._tool_proximity(*seen)
         if near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
         elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
             touching_W = self._plant_contact_about_world(context)
         else:
-            touching_W = _NO_GIVEN_WRENCH
+            touching_W = _USE_COMPILED_CONTACT
         self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
 
     def _take_samples(
@@ -502,7 +502,7 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        inputs = self._evaluate_inputs(context, seen)
+        inputs = self._sampling_inputs(context, seen)
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
@@ -524,7 +524,7 @@ class WristSensor(LeafSystem):
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
             seen = self._arm_state_and_surroundings(context)
-            if not self._watched.size or self._contact_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
+            if not self._watched.size or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
@@ -532,7 +532,7 @@ class WristSensor(LeafSystem):
 
     def _are_samples_due(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
-        margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
+        margin, (held, block) = _TIME_TOLERANCE_PERIODS * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
@@ -548,7 +548,7 @@ class WristSensor(LeafSystem):
         physics = self._physics
         if (
             self._beyond_contact_law
-            or self._contact_proximity(state, around) == PROXIMITY_NEAR_MONITORED
+            or self._tool_proximity(state, around) == PROXIMITY_NEAR_MONITORED
         ):
             applied = applied + self._plant_contact_about_So(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
@@ -600,7 +600,7 @@ def AddCompiledWristSensor(
         noise = builder.AddNamedSystem(
             "wrist_sensor_noise",
             RandomSource(
-                RandomDistribution.kGaussian, NOISE_SIZE, SAMPLES_PER_NOISE_BLOCK * period
+                RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, SAMPLES_PER_NOISE_BLOCK * period
             ),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
