@@ -44,7 +44,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
-    if scenario.is_direct:
+    if scenario.has_direct_channel:
         wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]
         if scenario.contact_detection is not None:
             wires.append(("contact", "contact_at_hand", 1))
@@ -58,7 +58,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_wrench_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _with_device_limits(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             _contact_force_scale(scenario),
@@ -84,7 +84,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_wrench_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _with_device_limits(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -118,7 +118,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def power_scale_of_scenario(scenario: Scenario) -> Array:
+def slave_wrench_power_scale(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_force_scale(scenario) / np.where(scales > 0.0, scales, 1.0)

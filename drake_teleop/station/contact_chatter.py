@@ -13,13 +13,13 @@ from drake_teleop.station.oscillation import remove_explained_times, split_at_ga
 Array = NDArray[np.float64]
 
 # A touch begins where the force exceeds this share of the largest force within the time around it.
-_TOUCH_FORCE_SHARE, _FORCE_WINDOW_S = 0.1, 0.1
+_TOUCH_FORCE_SHARE, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
 # Smallest time between two touches [s]; closer ones are bounces of one touch-down.
 _MIN_TOUCH_INTERVAL_S = 0.005
 # Largest time between two touches of a series [s]: 5 Hz.
 _MAX_TOUCH_INTERVAL_S = 0.2
 # Smallest number of touches, duration [s] and force [N] of a series.
-_MIN_TOUCHES, _MIN_DURATION_S, _MIN_FORCE_N = 8, 0.3, 0.5
+_MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].
 _MAX_TIME_TO_REVERSAL_S = 0.1
 
@@ -47,11 +47,11 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
     touches = remove_explained_times(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
     found = []
     for series in split_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
-        if len(series) < _MIN_TOUCHES or series[-1] - series[0] < _MIN_DURATION_S:
+        if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:
             continue
         start, stop = float(series[0]), float(series[-1])
         peak = float(force[(t >= start) & (t <= stop)].max())
-        if peak >= _MIN_FORCE_N:
+        if peak >= _MIN_CHATTER_FORCE_N:
             rate = (len(series) - 1) / (stop - start)
             found.append(Chatter(len(series), rate, peak, start, stop))
     return found
@@ -60,7 +60,7 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
 def _find_touches(t: Array, force: Array) -> Array:
     if len(t) < 2:
         return np.empty(0)
-    rows = 2 * round(_FORCE_WINDOW_S / (t[1] - t[0])) + 1
+    rows = 2 * round(_PEAK_FORCE_WINDOW_S / (t[1] - t[0])) + 1
     least = _TOUCH_FORCE_SHARE * maximum_filter1d(force, rows)[1:]
     starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
     return starts[np.diff(starts, prepend=-np.inf) >= _MIN_TOUCH_INTERVAL_S]

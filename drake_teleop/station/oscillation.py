@@ -11,15 +11,15 @@ Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
 _MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
-REVERSAL_WINDOW_S = 0.25
+REVERSAL_DELAY_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
-MAX_HIGH_FREQUENCY_FORCE_N = 0.05
+MAX_FORCE_RIPPLE_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 
 
-def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
+def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
     """Return indices of maxima and minima of x (N,); successive ones differ by > `swing`."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
@@ -37,8 +37,8 @@ def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp)
 
 
-def find_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_WINDOW_S
+def flag_unexplained_oscillation(
+    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
@@ -49,33 +49,33 @@ def find_unexplained_oscillation(
         t: (N,) times [s].
         command, actual: (N, k) commanded and actual motion in the unit of `swing`.
     """
-    commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
+    commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_explained_times(t[find_reversals(x, swing)], commanded, near)
+        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, near)
         for series in split_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
     return oscillating
 
 
-def find_unexplained_pose_oscillation(
+def flag_unexplained_pose_oscillation(
     t: Array, command: Array, actual: Array, near: float
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not."""
-    turned, wanted = (doubled_quaternions_near(pose, command) for pose in (actual, command))
-    swaying = find_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
-    return swaying | find_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
+    turned, wanted = (quaternions_as_angles(pose, command) for pose in (actual, command))
+    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
+    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
 
 
-def pose_reversals(t: Array, pose: Array) -> Array:
+def pose_reversal_times(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
-    rows = [find_reversals(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
-    rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in doubled_quaternions_near(pose, pose).T]
+    rows = [reversal_indices(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
+    rows += [reversal_indices(x, _MIN_AMPLITUDE_RAD) for x in quaternions_as_angles(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
-def doubled_quaternions_near(pose: Array, reference: Array) -> Array:
+def quaternions_as_angles(pose: Array, reference: Array) -> Array:
     """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
     Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).

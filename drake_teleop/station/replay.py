@@ -52,7 +52,7 @@ _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
 _MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target without a haptic device
+_CAMERA_SHIFT_WITHOUT_DEVICE_W = np.array([-0.3, 0.0, 0.0])  # of camera and target
 
 
 _FLOOR_COLOUR, _WOOD_COLOUR, _STEEL_COLOUR = (
@@ -130,7 +130,7 @@ def write_replay(
         readings=_displayed_numbers(signals),
         shaded=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm a newton, as large as at the slave.",),
-        curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
+        curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
@@ -150,11 +150,13 @@ def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
 def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
     readings = [
-        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)
+        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, has_arrow=True)
     ]
     if "contact_wrench_S" in signals:
         contact = _row_norms(signals["contact_wrench_S"][:, :3])
-        readings.append(DisplayedNumber("Contact, calculated", "N", contact, VERMILION, arrow=True))
+        readings.append(
+            DisplayedNumber("Contact, calculated", "N", contact, VERMILION, has_arrow=True)
+        )
     if "force_to_master" in signals:
         readings.append(
             DisplayedNumber("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
@@ -255,7 +257,7 @@ class ReplayScene:
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
             state = signals["master_state"][sample]
-            q = self._master.positions(state[: len(state) // 2])
+            q = self._master.to_plant_positions(state[: len(state) // 2])
             plant.SetPositions(context, self._master.instance, q)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
@@ -305,14 +307,14 @@ class ReplayScene:
 class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` is a function from logged joint positions to the plant's.
+    `to_plant_positions` is a function from logged joint positions to the plant's.
     """
 
     instance: ModelInstanceIndex
     hand: Frame
     grip: Array
-    positions: Callable[[Array], Array]
-    folder: object = None
+    to_plant_positions: Callable[[Array], Array]
+    model_folder: object = None
 
 
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
@@ -364,5 +366,5 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
                 f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
             )
     set_plain_background(meshcat)
-    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_W
+    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -132,7 +132,7 @@ class Scenario:
         return things[0] if len(things) == 1 else SeveralObjects(things)
 
     @property
-    def leaf(self) -> SheetSpring | None:
+    def first_sheet_spring(self) -> SheetSpring | None:
         """Sheet spring from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._touchables if isinstance(thing, SheetSpring)), None)
 
@@ -146,7 +146,7 @@ class Scenario:
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
-    def is_direct(self) -> bool:
+    def has_direct_channel(self) -> bool:
         """True if no network and no passivity method are between master and slave."""
         return (
             self.passivity.method == "none"
@@ -198,7 +198,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     Raises:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
-    data, where = ReadScenario(name_or_path)
+    data, where = ReadScenarioData(name_or_path)
     scenario = ScenarioFromData(data, where)
     folder = Path(where).parent
     scenario.slave = scenario.slave.with_absolute_paths(folder)
@@ -210,13 +210,13 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     return scenario
 
 
-def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
+def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
     """Read a scenario file; return the unchecked data, and the file's name for messages."""
-    path = shipped_file("scenario", name_or_path, scenarios_dir())
+    path = find_shipped_file("scenario", name_or_path, scenarios_dir())
     return read_yaml(path, tagged=True), str(path)
 
 
-def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
+def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
     A DrakeTeleopError about "no `kind`", such as "scenario", is raised if neither exists.
@@ -325,7 +325,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
     if scenario.master.is_joint_leader and not (
-        scenario.is_direct and scenario.contact_detection is None
+        scenario.has_direct_channel and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
             "a leader that commands joints requires a direct channel (a network transmits poses)",

@@ -17,7 +17,7 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
+_MAX_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
 _YAML_FILE_HEAD = """\
 # Each field has its value, [the permitted values] and its meaning. Omitted fields have their
@@ -51,13 +51,13 @@ def to_commented_yaml(scenario: Scenario) -> str:
     return _YAML_FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
-def _find_texts(value: Any) -> list[str]:
+def _texts_in(value: Any) -> list[str]:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
         value = [*value, *value.values()]
     if isinstance(value, (list, tuple)):
-        return [word for each in value for word in _find_texts(each)]
+        return [word for each in value for word in _texts_in(each)]
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
@@ -73,11 +73,9 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
-    if found != scenario and _find_texts(found) != _find_texts(scenario):
+    if found != scenario and _texts_in(found) != _texts_in(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
-        lost = [
-            n for n in names if _find_texts(getattr(found, n)) != _find_texts(getattr(scenario, n))
-        ]
+        lost = [n for n in names if _texts_in(getattr(found, n)) != _texts_in(getattr(scenario, n))]
         raise DrakeTeleopError(
             f"YAML cannot represent the scenario's block {' and '.join(lost)}",
             where=where,
@@ -113,7 +111,7 @@ def _block_lines(config: Any) -> list[str]:
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {format_yaml(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
-    column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
+    column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = (
         preset_of_block({"preset": config.preset})
         if isinstance(config, WristSensorConfig)

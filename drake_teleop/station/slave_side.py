@@ -40,7 +40,7 @@ from drake_teleop.station.wiring import connect_ports, export_outputs
 Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
-MONITOR_PERIOD_S = 0.01
+SLAVE_MONITOR_PERIOD_S = 0.01
 # See `_check_friction_time_step`.
 _MAX_FRICTION_RATE_TIMES_STEP = 2.0
 
@@ -122,7 +122,7 @@ def MakeSlaveSide(
         ),
     )
     estimate = body.load_estimator.GetOutputPort("load_estimate")
-    builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
+    builder.Connect(body.sample_ports["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
     export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
@@ -133,7 +133,7 @@ def MakeSlaveSide(
     builder.Connect(state, kinematics.GetInputPort("slave_state"))
     export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
-        inputs = body.sample | {
+        inputs = body.sample_ports | {
             "slave_state": state,
             "pose_slave": kinematics.GetOutputPort("pose_slave"),
             "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
@@ -156,7 +156,7 @@ def MakeSlaveSide(
                 scenario.contact_detection, noise_floor, arm, 1 / scenario.rates.estimator_hz
             ),
         )
-        builder.Connect(body.sample["sample"], detection.GetInputPort("sample"))
+        builder.Connect(body.sample_ports["sample"], detection.GetInputPort("sample"))
         builder.Connect(estimate, detection.GetInputPort("load_estimate"))
         export_outputs(builder, detection, "contact")
     return builder.Build()
@@ -185,10 +185,10 @@ def _add_inverse_kinematics(
     make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
     make_ik = JointFollower if led else make_ik
     ik = builder.AddNamedSystem(
-        "inverse_kinematics", make_ik(arm, body.slave.start, body.command_period)
+        "inverse_kinematics", make_ik(arm, body.slave.start, body.command_period_s)
     )
     if not led:
-        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
+        builder.Connect(body.sample_ports["joint_position"], ik.GetInputPort("joint_position"))
     builder.Connect(
         ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
     )
@@ -223,8 +223,8 @@ class _SlaveBlocks:
     joint_control: LeafSystem
     monitor: LeafSystem
     load_estimator: LeafSystem
-    sample: dict[str, OutputPort]
-    command_period: float  # period of joint commands [s]
+    sample_ports: dict[str, OutputPort]
+    command_period_s: float
 
 
 def _add_slave_blocks(
@@ -259,7 +259,7 @@ def _add_slave_blocks(
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD_S))
+    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, SLAVE_MONITOR_PERIOD_S))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
     sample = AddCompiledWristSensor(

@@ -77,7 +77,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         measures_of_success = dict.fromkeys(measures_of_success, math.nan)
     figures = measures_of_success | {
         "success": float(success),
-        "detection_time_s": detection_time(t[span], touching, noticed),
+        "detection_time_s": detection_delay(t[span], touching, noticed),
         "false_notices": float(_count_false_detections(touching, noticed)),
     }
     return {name: figures[name] for name in TASK_MEASURE_NAMES}
@@ -130,7 +130,7 @@ def contact_force(result: SimulationResult) -> Array:
     return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
 
 
-def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
+def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
     """Return the time from the first contact to its detection [s]; nan if either is missing."""
     if not touching.any():
         return math.nan

@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
 from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.channel_side import MakeChannel, _limit_wrench_to_device
+from drake_teleop.station.channel_side import MakeChannel, _with_device_limits
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.memory import LAST_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -38,7 +38,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.peak_force, min(device.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _limit_wrench_to_device(scenario, own)
+    limited = _with_device_limits(scenario, own)
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)

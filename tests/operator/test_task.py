@@ -30,7 +30,7 @@ from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, T
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import contact_force, detection_time, task_measures
+from drake_teleop.station.task_measures import contact_force, detection_delay, task_measures
 
 #: Rates of a study: the operator notices no difference.
 FAST = {
@@ -262,7 +262,7 @@ def test_papers_contact_is_detected_without_false_detection():
     )
     touching = contact_force(result) > 0.0
     assert not noticed[: np.argmax(touching)].any()
-    assert detection_time(result.t, touching, noticed) < 0.03
+    assert detection_delay(result.t, touching, noticed) < 0.03
 
 
 def test_movements_are_continuous_to_acceleration():

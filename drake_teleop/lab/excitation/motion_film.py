@@ -56,8 +56,8 @@ def write_motion_film(path: Path, found: Excitation) -> None:
             DisplayedNumber("Speed of the sensor", "m/s", speed),
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
-        clock="of the motion",
-        curves="force at the sensor, 0 to {top} N",
+        clock_label="of the motion",
+        curves_label="force at the sensor, 0 to {top} N",
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
