@@ -20,7 +20,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
-from drake_teleop.station.film import (
+from drake_teleop.station.master.data_sheets import PHANTOM_NAME
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.master.phantom import serial_joint_angles
+from drake_teleop.station.replay_file import (
     Canvas,
     DisplayedNumber,
     ForceArrow,
@@ -30,9 +33,6 @@ from drake_teleop.station.film import (
     frame_times,
     set_plain_background,
 )
-from drake_teleop.station.master.data_sheets import PHANTOM_NAME
-from drake_teleop.station.master.leader_model import Leader
-from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
@@ -135,7 +135,7 @@ def write_replay(
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
         scene = ReplayScene(meshcat, scenario, signals)
-        return lambda film_time, frame: scene.show_sample(film_time, signals, frame)
+        return lambda replay_time, frame: scene.show_sample(replay_time, signals, frame)
 
     film.write(path, make_scene)
 
@@ -251,8 +251,8 @@ class ReplayScene:
             elif shapes:
                 yield path, body
 
-    def show_sample(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Record row `sample` of the signals as the scene at `film_time` [s] of the replay."""
+    def show_sample(self, replay_time: float, signals: Mapping[str, Array], sample: int) -> None:
+        """Record row `sample` of the signals as the scene at `replay_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -265,14 +265,14 @@ class ReplayScene:
             if name in signals:
                 self._set_body_pose(body, signals[name][sample])
         for path, body in self._bodies.items():
-            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
+            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), replay_time)
         if not self._arrows:
             return
         forces, places = self._contact_forces_W(signals, sample), self._arrow_positions_W()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
-            arrow.show_force(self.canvas, film_time, places[place], f_W)
+            arrow.show_force(self.canvas, replay_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())

@@ -40,7 +40,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,

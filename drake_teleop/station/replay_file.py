@@ -218,8 +218,8 @@ class ForceArrow:
         head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
 
-    def show_force(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `film_time` [s]."""
+    def show_force(self, canvas: Canvas, replay_time: float, place: Array, force: Array) -> None:
+        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `replay_time` [s]."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
@@ -227,12 +227,12 @@ class ForceArrow:
         middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
         back = along @ _HALF_TURN_ABOUT_X
         put = canvas.SetTransform
-        put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
-        put(f"{self._path}/head", RigidTransform(back, tip), film_time)
+        put(f"{self._path}/shaft", RigidTransform(along, middle), replay_time)
+        put(f"{self._path}/head", RigidTransform(back, tip), replay_time)
         scale = canvas.SetProperty
         size = min(1.0, length / _HEAD_LENGTH_M)
-        scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
-        scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)
+        scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], replay_time)
+        scale(f"{self._path}/head/scaled", "scale", [size, size, size], replay_time)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from drake_teleop.station.film import DisplayedNumber, ReplayFile, frame_times
+from drake_teleop.station.replay_file import DisplayedNumber, ReplayFile, frame_times
 
 
 @pytest.mark.parametrize(
