@@ -46,7 +46,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def __init__(self, meshcat, name, colour):
             self.name = name
 
-        def show_force(self, canvas, film_time, place, force):
+        def show_force(self, canvas, replay_time, place, force):
             shown[self.name] = force
 
     monkeypatch.setattr(replay, "ForceArrow", Arrow)
@@ -208,8 +208,8 @@ def test_replay_has_fifty_frames_per_second(
         def __init__(self, meshcat, scenario, recorded):
             self.meshcat = meshcat
 
-        def show_sample(self, film_time, signals, sample):
-            kept[np.floor(film_time * self.meshcat.rate)] = signals["slave_state"][sample]
+        def show_sample(self, replay_time, signals, sample):
+            kept[np.floor(replay_time * self.meshcat.rate)] = signals["slave_state"][sample]
 
     monkeypatch.setattr(film, "Meshcat", Recorder)
     monkeypatch.setattr(replay, "ReplayScene", Scene)
