@@ -149,7 +149,7 @@ class Record:
             "rms": rms(wrench[:, :3]),
             "peak": float(np.linalg.norm(wrench[:, :3], axis=1).max()),
             "torque_rms": rms(wrench[:, 3:]),
-            "delay_ms": 1e3 * path_delays(config, sensor, T).sample,
+            "delay_ms": 1e3 * path_delays(config, sensor, T).sample_s,
             "microseconds": microseconds,
         }
 

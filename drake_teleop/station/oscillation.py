@@ -98,7 +98,7 @@ def split_at_gaps(times: Array, longest: float) -> list[Array]:
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
 
-def high_pass(t: Array, signal: Array) -> Array:
+def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
     """Return the part of `signal` (N, k) above 5 Hz, for evenly spaced times `t` (N,) [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")

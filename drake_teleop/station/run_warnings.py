@@ -22,7 +22,7 @@ from drake_teleop.station.oscillation import (
     REVERSAL_DELAY_S,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
-    high_pass,
+    high_pass_above_5_hz,
     pose_reversal_times,
     quaternions_as_angles,
 )
@@ -311,7 +311,7 @@ def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans
     if not {"ports", "intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
-    force = high_pass(t, result["force_to_master"][:, :3])
+    force = high_pass_above_5_hz(t, result["force_to_master"][:, :3])
     rows = round(_MIN_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
     largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M

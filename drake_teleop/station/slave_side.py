@@ -117,7 +117,7 @@ def MakeSlaveSide(
             scenario.force_scaling,
             arm,
             R_WB,
-            scenario.wrist_sensor.largest_wrench(),
+            scenario.wrist_sensor.largest_plausible_wrench(),
             max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz),
         ),
     )

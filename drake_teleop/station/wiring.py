@@ -47,7 +47,7 @@ def connect_ports(
     builder.Connect(output, port)
 
 
-def record_signals(
+def build_with_log(
     builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
 ) -> Diagram:
     """Export and record the sides' signals at `log_hz`; build the diagram."""

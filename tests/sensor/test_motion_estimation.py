@@ -159,7 +159,7 @@ def test_noiseless_sensor_gives_truth_of_one_earlier_instant(source, tolerance, 
     config = MotionEstimationConfig(source=source)
     t = np.arange(12000) * T
     samples = sampled(truth_of(swinging(t)), sensor, config)[SETTLED:]
-    delay = path_delays(config, sensor, T).sample
+    delay = path_delays(config, sensor, T).sample_s
     earlier = truth_of(swinging(t[SETTLED:] - delay))
     got = np.hstack([samples[:, :15], samples[:, 16:]])
     error = np.abs(got - earlier).max(axis=0) / np.abs(earlier).max(axis=0)
@@ -237,7 +237,7 @@ def test_wrench_and_motion_are_in_phase(source, preset, frequency):
     strong = np.abs(true) > 0.05 * np.repeat([np.abs(true[:3]).max(), np.abs(true[3:]).max()], 3)
     assert np.abs(mismatch[strong] - expected).max() < 0.02
     lateness = -np.angle(measured / true) / per_sample
-    delay = path_delays(config, sensor, T).sample / T
+    delay = path_delays(config, sensor, T).sample_s / T
     assert np.abs(lateness[strong] - delay).max() < 0.05
 
 
@@ -247,14 +247,14 @@ def test_the_delays_add_up():
     )
     low_pass = 1 / (2 * np.pi * 500) / np.sin(np.pi / 8)  # sum of 2 zeta of a Butterworth
     delays = path_delays(MotionEstimationConfig("fused"), sensor, T)
-    assert delays.wrench == pytest.approx(low_pass + 1e-3, abs=0.1 * T)
-    assert delays.acceleration == delays.sample == pytest.approx(delays.wrench + 2e-3)
-    assert delays.encoders == pytest.approx(delays.wrench + 1e-3)
+    assert delays.wrench_s == pytest.approx(low_pass + 1e-3, abs=0.1 * T)
+    assert delays.acceleration_s == delays.sample_s == pytest.approx(delays.wrench_s + 2e-3)
+    assert delays.encoders_s == pytest.approx(delays.wrench_s + 1e-3)
     encoders = path_delays(MotionEstimationConfig("encoders", 50.0), sensor, T)
-    assert encoders.encoders == pytest.approx(11 * low_pass + 2e-3, abs=0.2 * T)
-    assert 0 <= encoders.sample - encoders.encoders < T
-    assert (encoders.sample - encoders.wrench) / T == pytest.approx(
-        round((encoders.sample - encoders.wrench) / T)
+    assert encoders.encoders_s == pytest.approx(11 * low_pass + 2e-3, abs=0.2 * T)
+    assert 0 <= encoders.sample_s - encoders.encoders_s < T
+    assert (encoders.sample_s - encoders.wrench_s) / T == pytest.approx(
+        round((encoders.sample_s - encoders.wrench_s) / T)
     )
 
 
@@ -369,8 +369,8 @@ def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
     assert plain["fused"][1] < 1.0 and off["fused"][1] < 1.0
     # Encoders leave less, 8 ms later.
     assert plain["encoders"][0] < plain["fused"][0]
-    late = path_delays(MotionEstimationConfig("encoders"), sensor, T).sample
-    assert late > 8e-3 + path_delays(MotionEstimationConfig(), sensor, T).sample
+    late = path_delays(MotionEstimationConfig("encoders"), sensor, T).sample_s
+    assert late > 8e-3 + path_delays(MotionEstimationConfig(), sensor, T).sample_s
 
 
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])

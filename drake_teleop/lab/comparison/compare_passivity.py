@@ -39,7 +39,7 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.oscillation import high_pass
+from drake_teleop.station.oscillation import high_pass_above_5_hz
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
@@ -176,7 +176,7 @@ def simulate_press(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    fast = high_pass(result.t[held], result["force_to_master"][held, :3])
+    fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),

@@ -52,7 +52,7 @@ def sensor_noise(
     elif estimation.source == "fused":
         angular, linear = fusion_filters(estimation, sensor, num_joints, period)
         filters = _error_filter(linear, period), _error_filter(angular, period)
-    place = sensor.accelerometer()[0]
+    place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
 

@@ -62,21 +62,21 @@ class OperatorTraining:
         R_WB: (3, 3) orientation of the master's base in the world.
         translation_scale: displacement of the tool over displacement of the hand.
         force_gain: rendered force over true contact force.
-        forward, backward: mean one-way delays [s].
+        forward_delay_s, backward_delay_s: mean one-way delays [s].
     """
 
     R_WB: Array
     translation_scale: float
     force_gain: float
-    forward: float
-    backward: float
+    forward_delay_s: float
+    backward_delay_s: float
     seed: int
 
 
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: Movement
 ) -> Array:
-    there_and_back = training.forward + training.backward + _MOVE_EFFECT_DELAY_S
+    there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM))
     return np.array(
@@ -100,7 +100,7 @@ def pack_task_parameters(task: Task) -> Array:
         task.timeout,
     )
     packed[_GOAL : _GOAL + 3] = task.translation
-    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.distance
+    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.target_distance
     if isinstance(task, Reach):
         packed[[_TARGET_RADIUS, _DWELL]] = task.width / 2, task.dwell
         return packed

@@ -227,7 +227,7 @@ def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, 
 
 
 @njit(cache=True, borrows=True)
-def _hand_wrench_at(
+def _hand_wrench_at_time(
     packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
     _intended_or_planned_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
@@ -326,7 +326,7 @@ class Operator(LeafSystem):
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
-        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
@@ -344,7 +344,7 @@ class Operator(LeafSystem):
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
         self._seen_displacements = _make_ring_buffer(
-            senses.vision_delay + training.backward, np.zeros(3)
+            senses.vision_delay + training.backward_delay_s, np.zeros(3)
         )
         self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
@@ -406,7 +406,7 @@ class Operator(LeafSystem):
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _hand_wrench_at(
+        _hand_wrench_at_time(
             *self._evaluate_intended_motion(context),
             self._decision_memory(context),
             context.get_time(),
@@ -418,7 +418,7 @@ class Operator(LeafSystem):
             output.get_mutable_value(),
         )
 
-    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
         time, pose, memory = (
             context.get_time(),
             output.get_mutable_value(),

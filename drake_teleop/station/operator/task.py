@@ -17,7 +17,7 @@ class _Task:
     )
 
     @property
-    def distance(self) -> float:
+    def target_distance(self) -> float:
         """Distance from the tool's start to the target [m]."""
         return math.hypot(*self.translation)
 
@@ -107,10 +107,10 @@ class Movement:
 def check_distance(task: Task, where: str) -> None:
     """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
-    if task.distance <= least:
+    if task.target_distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m (its "
-            "radius or standoff)",
+            f"the target is {task.target_distance:g} m from the tool's start, not above {least:g}"
+            " m (its radius or standoff)",
             where=f"{where}.translation",
             remedy="choose a target farther from the tool's start",
         )

@@ -20,9 +20,9 @@ from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_DIRECTION,
     CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
-    DRAG,
+    DRAG_WRENCH,
     IN_CONTACT,
-    INITIAL,
+    INITIAL_ENERGY,
     LEDGER_LEVEL,
     MASTER_RESERVE,
     MEAN_WRENCH,
@@ -145,19 +145,19 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
+        p[INITIAL_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
             self.hand_reserve,
         )
-        p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
+        p[DRAG_WRENCH] = np.divide(self.drag, p[MOTION_SCALE])
         p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[STORED_ENERGY] = p[INITIAL] / 2.0
+    memory[STORED_ENERGY] = p[INITIAL_ENERGY] / 2.0
     memory[SERVO_MODEL_POSE] = memory[COMMAND_POSE]
 
 
@@ -416,7 +416,7 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
     elif in_contact or lowest >= _DRAG_OFF_LEVEL:
         active[g] = 0.0
     if active[g] > 0.0:
-        drag = p[DRAG][g]
+        drag = p[DRAG_WRENCH][g]
     if speed < _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g]:
         memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND_SINCE_REST][g] > 0.0:

@@ -88,8 +88,8 @@ NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _layout = own_parameters()
-INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-DRAG, CONTACT_THRESHOLD = _layout.vector(2), _layout.vector(2)
+INITIAL_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
+DRAG_WRENCH, CONTACT_THRESHOLD = _layout.vector(2), _layout.vector(2)
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = own_memory()
@@ -186,7 +186,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
-    delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)
+    delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)
     share = min(T / delay, 1.0) if memory[STEP_COUNT] > 0.0 else 1.0
     for i in range(6):
         filtered[i] += share * (load[i] - filtered[i])
@@ -255,14 +255,14 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
 
 
 @njit(cache=True)
-def _servo_lag(p):
+def _servo_lag_s(p):
     return 2.0 * math.sqrt(p[SLAVE_MASS][0] / p[SERVO_K][0])
 
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
-    depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
+    depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
     for g in range(2):
         travel, reserve = (
             ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth,

@@ -97,13 +97,13 @@ class MotionEstimationConfig:
 class PathDelays:
     """Delays of the signal paths at low frequencies [s].
 
-    `sample` is the delay of the slowest path in use, for which the others wait.
+    `sample_s` is the delay of the slowest path in use, for which the others wait.
     """
 
-    wrench: float
-    acceleration: float
-    encoders: float
-    sample: float
+    wrench_s: float
+    acceleration_s: float
+    encoders_s: float
+    sample_s: float
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def steady_state_kalman_filter(
 def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
-    wrench, acceleration, encoders = sensor.delays(period)
+    wrench, acceleration, encoders = sensor.reading_delays(period)
     encoders += _group_delay_samples(_angle_low_pass_sections(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
@@ -211,7 +211,7 @@ def _accelerometer_std(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
-    p_SoAo_S, R_SA = sensor.accelerometer()
+    p_SoAo_S, R_SA = sensor.accelerometer_pose()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
     x, y, z = p_SoAo_S**2
     crossed = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]]) @ alpha_std**2
@@ -223,12 +223,12 @@ def initialize_motion_estimator(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
-    paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
+    paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
     used = np.array([True, config.source != "encoders", True])
-    waits = np.where(used, delays.sample - paths, 0.0) / period
+    waits = np.where(used, delays.sample_s - paths, 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
-    p_SoAo_S, R_SA = sensor.accelerometer()
+    p_SoAo_S, R_SA = sensor.accelerometer_pose()
     angular, linear = fusion_filters(config, sensor, num_joints, period)
     constants = np.concatenate(
         [

@@ -63,8 +63,8 @@ from drake_teleop.station.sensor.sensor_chain import (
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
+    are_values_plausible,
     initialize_sensor_chain,
-    is_plausible,
     read_sensor_into,
 )
 
@@ -90,8 +90,8 @@ _BODY_MOTION_SIZE = 12
 
 
 class _SensorWeld(NamedTuple):
-    reaction: int
-    body: int
+    reaction_index: int
+    body_index: int
     geometry: Array
 
 
@@ -302,7 +302,7 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
 def _measure_sample_into(sensor, truth, noise, memory, sample):
     constants, motion_constants, end, ideal = sensor
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    if not is_plausible(constants, truth):  # keeps it out of the filters
+    if not are_values_plausible(constants, truth):  # keeps it out of the filters
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0

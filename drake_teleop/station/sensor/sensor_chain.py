@@ -172,7 +172,7 @@ class WristSensorConfig:
             ]
         )
 
-    def largest_wrench(self) -> NDArray[np.float64]:
+    def largest_plausible_wrench(self) -> NDArray[np.float64]:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
@@ -188,20 +188,20 @@ class WristSensorConfig:
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
-    def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def accelerometer_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return position p_SoAo_S (3,) [m] and axes R_SA (3, 3) of the accelerometer."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
 
-    def latencies(self, period: float) -> NDArray[np.int64]:
+    def latency_samples(self, period: float) -> NDArray[np.int64]:
         """Return the latencies (3,) of wrench, acceleration and encoders, in whole samples."""
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
-    def delays(self, period: float) -> NDArray[np.float64]:
+    def reading_delays(self, period: float) -> NDArray[np.float64]:
         """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
-        delays = self.latencies(period) * np.float64(period)
+        delays = self.latency_samples(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
             for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
                 lag = (b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)
@@ -338,12 +338,12 @@ def initialize_sensor_chain(
     `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
-    p_SoAo_S, R_SA = config.accelerometer()
+    p_SoAo_S, R_SA = config.accelerometer_pose()
     limits = config.ranges() if config.saturates else np.full(_NUM_CHANNELS, np.inf)
     sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
-    latencies = config.latencies(period)
+    latencies = config.latency_samples(period)
     constants = np.concatenate(
         [
             config.offset,
@@ -373,7 +373,7 @@ def initialize_sensor_chain(
 
 
 @njit(cache=True)
-def is_plausible(constants, truth):
+def are_values_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):

@@ -65,8 +65,8 @@ from drake_teleop.station.sensor.sensor_chain import (
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
+    are_values_plausible,
     initialize_sensor_chain,
-    is_plausible,
     read_sensor_into,
 )
 from drake_teleop.station.slave.arm import (
@@ -154,7 +154,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
-    if not is_plausible(constants, truth):  # keeps it out of the filters
+    if not are_values_plausible(constants, truth):  # keeps it out of the filters
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
