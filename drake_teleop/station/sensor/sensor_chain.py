@@ -321,7 +321,7 @@ _PATH_LATENCY_SAMPLES = _LOW_PASS_STAGE + 1  # (3,)
 _ENCODER_QUANTUM = _PATH_LATENCY_SAMPLES + 3
 _IS_IDEAL = _ENCODER_QUANTUM + 1
 _OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
-_BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
+_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
 _RANDOM_WALK_START = 1
@@ -419,20 +419,20 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
 
     _apply_calibration_errors(constants, truth, channels)
-    if place == _BEFORE_NOISE:
+    if place == _LOW_PASS_BEFORE_NOISE:
         if count == 0:
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
-    if place == _AFTER_CONVERTER and count == 0:
+    if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
     row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
-    if place == _AFTER_CONVERTER:
+    if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
     quantum = constants[_ENCODER_QUANTUM]
     for i in range(_DELAY_LINE_ROW_SIZE, width):

@@ -455,12 +455,12 @@ class WristSensor(LeafSystem):
         q = state[: self._n]
         return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
-    def _plant_contact_about_world(self, context: Context) -> Array:
+    def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _plant_contact_about_So(self, context: Context) -> Array:
-        wrench_W = self._plant_contact_about_world(context).copy()
+    def _plant_contact_wrench_So_W(self, context: Context) -> Array:
+        wrench_W = self._plant_contact_wrench_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
@@ -488,7 +488,7 @@ class WristSensor(LeafSystem):
         if near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
         elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
-            touching_W = self._plant_contact_about_world(context)
+            touching_W = self._plant_contact_wrench_W(context)
         else:
             touching_W = _USE_COMPILED_CONTACT
         self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
@@ -550,7 +550,7 @@ class WristSensor(LeafSystem):
             self._beyond_contact_law
             or self._tool_proximity(state, around) == PROXIMITY_NEAR_MONITORED
         ):
-            applied = applied + self._plant_contact_about_So(context)
+            applied = applied + self._plant_contact_wrench_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
