@@ -326,7 +326,7 @@ class Operator(LeafSystem):
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
-        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
@@ -418,7 +418,7 @@ class Operator(LeafSystem):
             output.get_mutable_value(),
         )
 
-    def _calc_intended_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_intent(self, context: Context, output: BasicVector) -> None:
         time, pose, memory = (
             context.get_time(),
             output.get_mutable_value(),
