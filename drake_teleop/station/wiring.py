@@ -35,8 +35,8 @@ def connect_ports(
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
-    _check_port_size(output, source, f"output port '{name}'")
-    _check_port_size(port, target, f"input port '{entry}'")
+    _check_port_exists(output, source, f"output port '{name}'")
+    _check_port_exists(port, target, f"input port '{entry}'")
     if output.size() != port.size():
         raise DrakeTeleopError(
             f"its output port '{name}' has {output.size()} numbers, but input port '{entry}' of "
@@ -75,7 +75,7 @@ def build_with_log(
     return diagram
 
 
-def _check_port_size(port: Any, side: System, what: str) -> None:
+def _check_port_exists(port: Any, side: System, what: str) -> None:
     if not port:
         raise DrakeTeleopError(
             f"the block has no {what}",
