@@ -22,10 +22,10 @@ from drake_teleop.station.sensor.motion_estimation import (
     _update_fusion_filters,
     estimate_sample_into,
     estimated_motion_std,
-    fusion_filters,
+    fusion_gains,
     initialize_motion_estimator,
     path_delays,
-    steady_state_kalman_filter,
+    steady_state_kalman_gains,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
@@ -292,13 +292,13 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
 @given(st.floats(-7, -3), st.floats(-3, 1), st.floats(-4, 2), st.sampled_from([T, 1e-3, 1e-2]))
 def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period):
     position_std, white, walk = 10.0**position, 10.0**acceleration, 10.0**drift
-    found = steady_state_kalman_filter(position_std, white, walk, period)
+    found = steady_state_kalman_gains(position_std, white, walk, period)
     # In samples and standard deviations of the position.
     F, h = np.array([[1.0, 1, 1], [0, 1, 1], [0, 0, 1]]), np.array([[1.0, 0, 0]])
     noise = white * period**2 / position_std * np.array([1.0, 1.0, 0.0])
     Q = np.outer(noise, noise)
     Q[2, 2] = (walk * period**2.5 / position_std) ** 2
-    gains = found.gains * [1, period, period**2]
+    gains = found * [1, period, period**2]
     # The gains are a fixed point of the Riccati equation: the covariance of the filter that has
     # them, a linear equation, gives them back.
     A = (np.eye(3) - gains[:, None] * h) @ F
@@ -308,14 +308,14 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
     P = np.linalg.solve(np.eye(9) - np.kron(A, A), N.ravel()).reshape(3, 3)
     ahead = F @ P @ F.T + Q
     np.testing.assert_allclose(ahead[:, 0] / (ahead[0, 0] + 1), gains, rtol=1e-3)
-    assert found.position_std == pytest.approx(position_std * np.sqrt(P[0, 0]), rel=1e-3)
-    assert found.innovation_std == pytest.approx(position_std * np.sqrt(ahead[0, 0] + 1), rel=1e-3)
+    assert gains[0] == pytest.approx(P[0, 0], rel=2e-3)
+    assert 1 / (1 - gains[0]) == pytest.approx(ahead[0, 0] + 1, rel=2e-3)
 
 
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
     """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
-    gains = steady_state_kalman_filter(position_std, acceleration_std, 1e-3, T).gains
+    gains = steady_state_kalman_gains(position_std, acceleration_std, 1e-3, T)
     crossover = np.sqrt(acceleration_std / position_std)
     assert gains[0] == pytest.approx(np.sqrt(2) * crossover * T, rel=0.05)
     assert gains[1] == pytest.approx(crossover**2 * T, rel=0.05)
@@ -323,7 +323,7 @@ def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
 
 def test_filter_errors_equal_the_predicted_deviations():
     position_std, white, walk, steps = 7e-6, 1.5, 3.0, 60000
-    found = steady_state_kalman_filter(position_std, white, walk, T)
+    gains = steady_state_kalman_gains(position_std, white, walk, T)
     random = np.random.default_rng(1)
     error = np.cumsum(walk * np.sqrt(T) * random.standard_normal((steps, 3)), axis=0)
     # True acceleration zero: what is measured is error and noise, and rate and angle stay zero.
@@ -332,19 +332,20 @@ def test_filter_errors_equal_the_predicted_deviations():
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
     for k in range(1, steps):
         acceleration, moved = measured[k] - bias, angle[k] - angle[k - 1]
-        _update_fusion_filters(found.gains, T, moved, acceleration, kept)
+        _update_fusion_filters(gains, T, moved, acceleration, kept)
         bias -= moved
         kept[6:9] = acceleration + moved
         estimates.append(angle[k] - kept[:3])
-        innovations.append(moved / found.gains[2])
-    assert np.std(estimates[8000:]) == pytest.approx(found.position_std, rel=0.04)
-    assert np.std(innovations[8000:]) == pytest.approx(found.innovation_std, rel=0.01)
+        innovations.append(moved / gains[2])
+    assert np.std(estimates[8000:]) == pytest.approx(position_std * np.sqrt(gains[0]), rel=0.04)
+    innovation_std = position_std / np.sqrt(1 - gains[0])
+    assert np.std(innovations[8000:]) == pytest.approx(innovation_std, rel=0.01)
 
 
 def test_gains_of_the_jr3_equal_the_docs():
-    angular, linear = fusion_filters(MotionEstimationConfig(), JR3, 6, T)
-    assert angular.crossover_hz == pytest.approx(28.9, abs=0.1)
-    assert linear.crossover_hz == pytest.approx(18.4, abs=0.1)
+    angular, linear = fusion_gains(MotionEstimationConfig(), JR3, 6, T)
+    assert np.cbrt(angular[2] / T) / (2 * np.pi) == pytest.approx(28.9, abs=0.1)
+    assert np.cbrt(linear[2] / T) / (2 * np.pi) == pytest.approx(18.4, abs=0.1)
 
 
 # What the elimination leaves of the paper's 100 N

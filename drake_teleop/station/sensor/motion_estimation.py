@@ -106,26 +106,12 @@ class PathDelays:
     sample_s: float
 
 
-@dataclass(frozen=True)
-class SteadyStateFilter:
-    """Steady-state Kalman filter of position, rate and error of a measured acceleration.
-
-    Attributes:
-        gains: (3,) gains of the innovation for position [1], rate [1/s], acceleration [1/s^2].
-        innovation_std, position_std: standard deviations, in the position's unit.
-        crossover_hz: the accelerometer dominates above this frequency, the positions below it.
-    """
-
-    gains: NDArray[np.float64]
-    innovation_std: float
-    position_std: float
-    crossover_hz: float
-
-
-def steady_state_kalman_filter(
+def steady_state_kalman_gains(
     position_std: float, acceleration_std: float, drift: float, period: float
-) -> SteadyStateFilter:
-    """Return the Kalman filter for a measured position x and acceleration a with a drifting error.
+) -> NDArray[np.float64]:
+    """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
+
+    The Kalman filter has a measured position x, and an acceleration a with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -147,12 +133,7 @@ def steady_state_kalman_filter(
     d = -delta / z
     third = np.prod(delta).real
     second = third + keeps * (d[0] * d[1] + d[0] * d[2] + d[1] * d[2]).real
-    return SteadyStateFilter(
-        gains=np.array([1.0 - keeps, second / period, third / period**2]),
-        innovation_std=float(position_std / np.sqrt(keeps)),
-        position_std=float(position_std * np.sqrt(1.0 - keeps)),
-        crossover_hz=float(np.cbrt(np.prod(np.abs(delta)))) / (2 * np.pi * period),
-    )
+    return np.array([1.0 - keeps, second / period, third / period**2])
 
 
 def path_delays(
@@ -166,15 +147,15 @@ def path_delays(
     return PathDelays(float(wrench), float(acceleration), float(encoders), float(sample))
 
 
-def fusion_filters(
+def fusion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[SteadyStateFilter, SteadyStateFilter]:
-    """Return the Kalman filters of source `fused` for angles [rad] and displacements [m]."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
-        steady_state_kalman_filter(angle_std, alpha_std.mean(), drift, period),
-        steady_state_kalman_filter(
+        steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
+        steady_state_kalman_gains(
             angle_std * _RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
         ),
     )
@@ -229,7 +210,7 @@ def initialize_motion_estimator(
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
     p_SoAo_S, R_SA = sensor.accelerometer_pose()
-    angular, linear = fusion_filters(config, sensor, num_joints, period)
+    angular, linear = fusion_gains(config, sensor, num_joints, period)
     constants = np.concatenate(
         [
             # An ideal accelerometer needs no correction.
@@ -238,8 +219,8 @@ def initialize_motion_estimator(
             p_SoAo_S,
             R_SA.ravel(),
             _angle_low_pass_sections(config, sensor, period).ravel(),
-            angular.gains,
-            linear.gains,
+            angular,
+            linear,
         ]
     )
     rows = int(np.ceil(waits.max())) + 1
