@@ -32,6 +32,7 @@ from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into
 from drake_teleop.station.operator.perception import Perception, update_perception_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
+from drake_teleop.station.passivity.packet import is_vector_finite, limit_group
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
 _MAX_HAND_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
@@ -174,27 +175,15 @@ def intended_motion_into(packed, start, t, pose, twist):
 @njit(cache=True)
 def normalize_pose_into(pose, twist, out):
     """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
-    square, rest = 0.0, 0.0
+    square = 0.0
     for k in range(4):
         square += pose[k] * pose[k]
-    for k in range(7):
-        rest += pose[k] - pose[k]  # NaN unless it is finite
-    for k in range(6):
-        rest += twist[k] - twist[k]
-    if not (rest == 0.0 and 0.0 < square < math.inf):
+    if not (is_vector_finite(pose) and is_vector_finite(twist) and 0.0 < square < math.inf):
         return False
     size = math.sqrt(square)
     for k in range(7):
         out[k] = pose[k] / size if k < 4 else pose[k]
     return True
-
-
-@njit(cache=True)
-def _limit_vector_length(vector, limit):
-    length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
-    if length > limit:
-        for k in range(3):
-            vector[k] *= limit / length
 
 
 @njit(cache=True)
@@ -213,8 +202,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit_vector_length(wrench[:3], _MAX_HAND_FORCE_N)
-    _limit_vector_length(wrench[3:], _MAX_HAND_TORQUE_NM)
+    limit_group(wrench, 0, _MAX_HAND_FORCE_N)
+    limit_group(wrench, 1, _MAX_HAND_TORQUE_NM)
 
 
 @njit(cache=True)
@@ -319,7 +308,9 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion() | {self.time_ticket()}
+        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        moving = {pose.ticket(), twist.ticket(), self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task requires the arguments training, arm and tip")
@@ -327,11 +318,6 @@ class Operator(LeafSystem):
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
-
-    def _declare_intended_motion(self) -> set[DependencyTicket]:
-        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
-        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
-        return {pose.ticket(), twist.ticket()}
 
     def _declare_task(
         self,
