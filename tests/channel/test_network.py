@@ -24,7 +24,6 @@ from drake_teleop.station.channel.network import (
     initial_network_state,
     network_parameters,
     newest_packets,
-    packet_delays,
     receive_packet,
     send_packet,
 )
@@ -44,6 +43,10 @@ STEPS = 700
 ROUGH = NetworkConfig(
     delay=0.04, jitter=1.0, distribution="gamma", loss=0.3, burst=0.02, duplicate=0.2
 )
+
+
+def packet_delays(config, seed, direction, steps, period):
+    return network.packet_delays(network_parameters(config, seed, direction, period), steps)
 
 
 def share(high: float = 1.0) -> st.SearchStrategy[float]:

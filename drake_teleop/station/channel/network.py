@@ -319,15 +319,9 @@ def _apply_silence_policy(policy, silent, packet):
             velocity[:] = 0.0
 
 
-def packet_delays(
-    config: NetworkConfig, seed: int, direction: int, steps: int, period: float
-) -> NDArray[np.int64]:
-    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
-    return _compute_packet_delays(network_parameters(config, seed, direction, period), steps)
-
-
 @njit(cache=True)
-def _compute_packet_delays(p, steps):
+def packet_delays(p, steps):
+    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
     delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
     for k in range(steps):
         bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
@@ -340,7 +334,7 @@ def newest_packets(
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = network_parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
-    for travel in _compute_packet_delays(p, steps).T:
+    for travel in packet_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])
