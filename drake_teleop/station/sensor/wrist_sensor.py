@@ -326,15 +326,19 @@ class WristSensor(LeafSystem):
         n = self._n = arm.num_joints
         constants, chain = initialize_sensor_chain(config, n, period)
         motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
-        self._offset = constants[OFFSET_CONSTANTS]
         self._physics, contact = slave.physics_of_plant, slave.contact
+        #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
+        #: are views that may be changed during a run.
+        self.offset, self.phi = constants[OFFSET_CONSTANTS], self._physics[1]
+        self.contact_pairs = self._physics[2]
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[SAMPLE_WRENCH] += config.offset
-        # Contact needs many steps per torque sample, so queueing them saves time.
-        self._beyond_contact_law = contact.beyond
+        #: Reason why contact is outside the compiled contact law, or "".
+        self.reason_beyond_contact_law = contact.beyond
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.beyond)
+        # Contact needs many steps per torque sample, so queueing them saves time.
         self._max_queued_steps = _MAX_QUEUED_STEPS if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
@@ -343,7 +347,8 @@ class WristSensor(LeafSystem):
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         # No reference to the plant: it would be a cycle with the Diagram that owns this block.
         self._watched, self._plant_size = contact.watched, contact.plant_size
-        self._moving = tuple(contact.moving)
+        #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
+        self.moving_bodies_sentence = ", ".join(contact.moving) + " can move" * bool(contact.moving)
         self._twin_arguments = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
@@ -381,36 +386,11 @@ class WristSensor(LeafSystem):
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
-        if self._beyond_contact_law:
+        if self.reason_beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
         self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_S, 0.0, self._check_acceleration)
-
-    @property
-    def offset(self) -> Array:
-        """Offset (6,) of force and torque [N, N m]; a view that may be changed during a run."""
-        return self._offset
-
-    @property
-    def phi(self) -> Array:
-        """Inertial parameters (10,) of the tool; a view that may be changed during a run."""
-        return self._physics[1]
-
-    @property
-    def contact_pairs(self) -> Array:
-        return self._physics[2]
-
-    @property
-    def reason_beyond_contact_law(self) -> str:
-        """Reason why contact is outside the compiled contact law, or ""."""
-        return self._beyond_contact_law
-
-    @property
-    def moving_bodies_sentence(self) -> str:
-        """Sentence that names the moving bodies around the arm except a sheet spring, or ""."""
-        names = ", ".join(self._moving)
-        return f"{names} can move" if names else ""
 
     @property
     def motion_dependent_indices(self) -> NDArray[np.intp]:
@@ -449,7 +429,7 @@ class WristSensor(LeafSystem):
     def _tool_proximity(self, state: Array, around: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
-        if self._beyond_contact_law:
+        if self.reason_beyond_contact_law:
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
@@ -547,7 +527,7 @@ class WristSensor(LeafSystem):
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
         physics = self._physics
         if (
-            self._beyond_contact_law
+            self.reason_beyond_contact_law
             or self._tool_proximity(state, around) == PROXIMITY_NEAR_MONITORED
         ):
             applied = applied + self._plant_contact_wrench_So_W(context)
