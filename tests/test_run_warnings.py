@@ -10,7 +10,6 @@ import pytest
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
-from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.phantom import (
     FORCE_LIMIT,
@@ -19,7 +18,11 @@ from drake_teleop.station.master.phantom import (
     jacobian_into,
 )
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
-from drake_teleop.station.oscillation import flag_unexplained_oscillation, reversal_indices
+from drake_teleop.station.oscillation import (
+    find_chatter,
+    flag_unexplained_oscillation,
+    reversal_indices,
+)
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult

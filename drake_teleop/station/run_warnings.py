@@ -14,12 +14,12 @@ from drake_teleop.common.numeric import contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
-from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
     MAX_FORCE_RIPPLE_N,
     REVERSAL_DELAY_S,
+    find_chatter,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
     high_pass_above_5_hz,
