@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from pydrake.systems.primitives import RandomSource
+from scipy.sparse.csgraph import connected_components
 
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
@@ -395,29 +396,19 @@ def _joints_of_plant(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
 
 
-def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    neighbours: dict[BodyIndex, list[BodyIndex]] = {}
-    for joint in _joints_of_plant(plant):
-        if joint.index() != weld.index():
-            parent, child = joint.parent_body().index(), joint.child_body().index()
-            neighbours.setdefault(parent, []).append(child)
-            neighbours.setdefault(child, []).append(parent)
-    parent, child = weld.parent_body().index(), weld.child_body().index()
-    load = _connected_bodies(neighbours, child)
-    if plant.world_body().index() in load:
-        return child, _connected_bodies(neighbours, parent)
-    return parent, load
-
-
-def _connected_bodies(
-    neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex
-) -> set[BodyIndex]:
-    found, ahead = {start}, [start]
-    while ahead:
-        new = set(neighbours.get(ahead.pop(), ())) - found
-        found |= new
-        ahead += new
-    return found
+def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
+    ends = [
+        (int(joint.parent_body().index()), int(joint.child_body().index()))
+        for joint in _joints_of_plant(plant)
+        if joint.index() != weld.index()
+    ]
+    linked = np.zeros((plant.num_bodies(), plant.num_bodies()))
+    linked[tuple(np.reshape(ends, (-1, 2)).astype(int).T)] = 1.0
+    _, group = connected_components(linked, directed=False)
+    arm, load = weld.parent_body().index(), weld.child_body().index()
+    if group[int(load)] == group[int(plant.world_body().index())]:
+        arm, load = load, arm
+    return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
 def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
