@@ -115,7 +115,7 @@ def write_replay(
             remedy="give the log of a station with a simulated slave",
         )
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
-    rows = _nearest_rows(result.t, times)
+    rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time
     # Read each signal of a log on disk once, and keep only the displayed rows.
     moving = [name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)]
     shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
@@ -138,13 +138,6 @@ def write_replay(
         return lambda replay_time, frame: scene.show_sample(replay_time, signals, frame)
 
     film.write(path, make_scene)
-
-
-def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
-    after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
-    after = np.minimum(after, len(t) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(times - t[before] <= t[after] - times, before, after)
 
 
 def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:

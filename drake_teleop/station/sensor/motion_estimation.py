@@ -301,12 +301,7 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    _delay_signal_paths(constants, memory, n, reading, sample)
-
-
-@njit(cache=True)
-def _delay_signal_paths(constants, memory, n, reading, sample):
-    angles, width = sample[SAMPLE_JOINT_POSITION], 12 + n
+    width = 12 + n
     line = memory[_JOINT_START + _NUM_VALUES_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)

@@ -416,12 +416,10 @@ class WristSensor(LeafSystem):
         append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
     def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
-        return self._state.Eval(context), self._evaluate_surroundings(context)
-
-    def _evaluate_surroundings(self, context: Context) -> Array:
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
-        return self._around if self._sheet is None else self._sheet.Eval(context)
+        around = self._around if self._sheet is None else self._sheet.Eval(context)
+        return self._state.Eval(context), around
 
     def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
@@ -446,22 +444,6 @@ class WristSensor(LeafSystem):
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
-    def _sampling_inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
-        return (
-            self._physics,
-            self._sensor,
-            self._period,
-            context.get_time(),
-            *seen,
-            (
-                self._torque.Eval(context),
-                self._no_rate if self._rate is None else self._rate.Eval(context),
-            ),
-            self._evaluate_applied_wrench(context),
-            self._no_noise if self._noise is None else self._noise.Eval(context),
-            context.get_discrete_state_vector().value(),
-        )
-
     def _calc_step(self, context: Context, output: BasicVector) -> None:
         seen = self._arm_state_and_surroundings(context)
         near = self._tool_proximity(*seen)
@@ -482,7 +464,20 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        inputs = self._sampling_inputs(context, seen)
+        inputs = (
+            self._physics,
+            self._sensor,
+            self._period,
+            context.get_time(),
+            *seen,
+            (
+                self._torque.Eval(context),
+                self._no_rate if self._rate is None else self._rate.Eval(context),
+            ),
+            self._evaluate_applied_wrench(context),
+            self._no_noise if self._noise is None else self._noise.Eval(context),
+            context.get_discrete_state_vector().value(),
+        )
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
