@@ -55,11 +55,9 @@ _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0
 _CAMERA_SHIFT_WITHOUT_DEVICE_W = np.array([-0.3, 0.0, 0.0])  # of camera and target
 
 
-_FLOOR_COLOUR, _WOOD_COLOUR, _STEEL_COLOUR = (
-    Rgba(0.93, 0.94, 0.95),
-    Rgba(0.78, 0.66, 0.50),
-    Rgba(0.40, 0.43, 0.47),
-)
+_FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
+_WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
+_STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
 _GRIP_P_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
 _WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.

@@ -252,10 +252,8 @@ def _perceive_and_decide(
         felt,
     )
     # The next entry to be overwritten is the oldest.
-    seen, felt = (
-        seen_displacements[(step + 1) % seen_displacements.shape[0]],
-        perceived_forces[(step + 1) % perceived_forces.shape[0]],
-    )
+    seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
+    felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
     decision.update_decision(task, person, time, seen, felt, task_state, memory)
 
 
@@ -405,11 +403,9 @@ class Operator(LeafSystem):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        time, pose, memory = (
-            context.get_time(),
-            output.get_mutable_value(),
-            self._decision_memory(context),
-        )
+        time = context.get_time()
+        pose = output.get_mutable_value()
+        memory = self._decision_memory(context)
         _intended_or_planned_motion_into(
             *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist
         )

@@ -342,11 +342,9 @@ def _differentiate_joint_angles(constants, joints, angles):
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    period, fused, starts = (
-        constants[_PERIOD_INDEX],
-        constants[_USE_FUSION_INDEX] != 0.0,
-        memory[0] == 0.0,
-    )
+    period = constants[_PERIOD_INDEX]
+    fused = constants[_USE_FUSION_INDEX] != 0.0
+    starts = memory[0] == 0.0
     s, omega, alpha = (
         sample[SAMPLE_SPECIFIC_FORCE],
         sample[SAMPLE_ANGULAR_VELOCITY],
@@ -358,10 +356,8 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
     for i in range(3):
         omega[i] = motion[3 + i]
 
-    angular, linear = (
-        memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START],
-        memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH_START],
-    )
+    angular = memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START]
+    linear = memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH_START]
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)

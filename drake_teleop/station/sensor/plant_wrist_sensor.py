@@ -78,14 +78,8 @@ _DEFAULT_PERIOD_S = 1e-3
 _STEP_RATIO_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
-_SENSOR_POSITION, _SENSOR_ORIENTATION, _WELD_ORIENTATION, _WELD_POSITION, _GRAVITY, _WRENCH_SIGN = (
-    0,
-    3,
-    12,
-    21,
-    24,
-    27,
-)
+_SENSOR_POSITION, _SENSOR_ORIENTATION = 0, 3
+_WELD_ORIENTATION, _WELD_POSITION, _GRAVITY, _WRENCH_SIGN = 12, 21, 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
 
@@ -279,15 +273,11 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
     R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION)), transposed(R_WB)
     s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY))))
-    omega, alpha = (
-        apply_matrix(R_SB, apply_matrix(R_BW, omega)),
-        apply_matrix(R_SB, apply_matrix(R_BW, alpha)),
-    )
+    omega = apply_matrix(R_SB, apply_matrix(R_BW, omega))
+    alpha = apply_matrix(R_SB, apply_matrix(R_BW, alpha))
     R_SJc = matrix_at(geometry, _WELD_ORIENTATION)
-    f, tau = (
-        apply_matrix(R_SJc, vector_at(reaction, 3)),
-        apply_matrix(R_SJc, vector_at(reaction, 0)),
-    )
+    f = apply_matrix(R_SJc, vector_at(reaction, 3))
+    tau = apply_matrix(R_SJc, vector_at(reaction, 0))
     tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION), f))
     for i in range(3):
         truth[SAMPLE_WRENCH.start + i] = geometry[_WRENCH_SIGN] * f[i]

@@ -409,10 +409,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     shift_delay_line(memory[_DELAY_LINE_START:], width)
     row = memory[_DELAY_LINE_START:][:width]
     channels = row[:_NUM_CHANNELS]
-    walks, filtered = (
-        memory[_RANDOM_WALK_START:FILTER_MEMORY_START],
-        memory[FILTER_MEMORY_START:_DELAY_LINE_START],
-    )
+    walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
+    filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
     sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         for i in range(_NUM_CHANNELS):
@@ -484,11 +482,9 @@ def _apply_calibration_errors(constants, truth, out):
 def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum, limit, value = (
-            constants[_QUANTUM_START + i],
-            constants[_RANGE_START + i],
-            channels[i],
-        )
+        quantum = constants[_QUANTUM_START + i]
+        limit = constants[_RANGE_START + i]
+        value = channels[i]
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)
         if abs(value) >= limit:

@@ -110,11 +110,9 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     """
     sensor_motion(arm, q, v, vdot, motion)
     copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
-    s, omega, alpha = (
-        out[SAMPLE_SPECIFIC_FORCE],
-        out[SAMPLE_ANGULAR_VELOCITY],
-        out[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = out[SAMPLE_SPECIFIC_FORCE]
+    omega = out[SAMPLE_ANGULAR_VELOCITY]
+    alpha = out[SAMPLE_ANGULAR_ACCELERATION]
     wrench = out[SAMPLE_WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
@@ -544,11 +542,9 @@ class WristSensor(LeafSystem):
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
-    touching, motion, truth = (
-        np.zeros(6),
-        np.zeros(FRAME_STATE_SIZE),
-        sample[SAMPLE_WRENCH_AND_MOTION],
-    )
+    touching = np.zeros(6)
+    motion = np.zeros(FRAME_STATE_SIZE)
+    truth = sample[SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
     sample[SAMPLE_JOINT_POSITION] = q
     return sample
