@@ -321,16 +321,10 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
 
 
 def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
-    order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
+    order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
     parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
-
-    def plant_positions(q: Array) -> Array:
-        ordered = np.empty(len(q))
-        ordered[order] = q
-        return ordered
-
     return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), plant_positions, parsed.folder
+        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.folder
     )
 
 

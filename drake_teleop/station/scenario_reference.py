@@ -171,7 +171,8 @@ def _sections_of_page(config: Any, path: str) -> Iterator[str]:
         for title, block in _titles_of_blocks(entry, path):
             yield f"\n## {title}\n"
             inner = entry.default if isinstance(entry.default, block) else block()
-            yield f"\n{_first_paragraph(inner)}\n"
+            first_paragraph, _, _ = (type(inner).__doc__ or "").partition("\n\n")
+            yield f"\n{' '.join(first_paragraph.split())}\n"
             yield from _sections_of_page(inner, f"{path}{entry.name}.")
 
 
@@ -194,10 +195,6 @@ def _links_to_blocks(entry: FieldInfo, path: str) -> str:
 
 def _anchor_of_title(title: str) -> str:
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-
-
-def _first_paragraph(config: Any) -> str:
-    return " ".join((type(config).__doc__ or "").partition("\n\n")[0].split())
 
 
 def _object_schema(config: Any) -> dict[str, Any]:
