@@ -233,10 +233,7 @@ def _check_reserve_speed_limit(
 def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    rotations = (
-        quaternions_as_angles(command, command),
-        quaternions_as_angles(actual, command),
-    )
+    rotations = (quaternions_as_angles(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
         (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),

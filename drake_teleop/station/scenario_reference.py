@@ -66,10 +66,8 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
     A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
-    text, where = (
-        "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario),
-        str(path),
-    )
+    text = "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario)
+    where = str(path)
     found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
@@ -112,11 +110,9 @@ def _block_lines(config: Any) -> list[str]:
     starts = {entry.name: f"{entry.name}: {format_yaml(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
-    preset = (
-        preset_of_block({"preset": config.preset})
-        if isinstance(config, WristSensorConfig)
-        else None
-    )
+    preset = None
+    if isinstance(config, WristSensorConfig):
+        preset = preset_of_block({"preset": config.preset})
     lines = []
     for entry in entries:
         if entry.kind == "block":

@@ -54,11 +54,9 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     span = slice(begun, ended + 1)
     done = state[ended, OUTCOME_INDEX] > 0.0
     force = contact_force(result)
-    held = (
-        _forces_during_hold(t, force, task, ended)
-        if done and isinstance(task, Press)
-        else np.empty(0)
-    )
+    held = np.empty(0)
+    if done and isinstance(task, Press):
+        held = _forces_during_hold(t, force, task, ended)
     wanted = _required_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
@@ -160,11 +158,8 @@ def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, 
     off = _tip_from_target(result, scenario, task, ended)
     if isinstance(task, Insert):
         above = off[2] + task.depth
-        return (
-            ""
-            if above <= _FLOOR_TOLERANCE_M
-            else f"the tip is {1e3 * above:.1f} mm above the floor"
-        )
+        wrong = f"the tip is {1e3 * above:.1f} mm above the floor"
+        return "" if above <= _FLOOR_TOLERANCE_M else wrong
     away = float(np.linalg.norm(off))
     if isinstance(task, Touch):
         return f"the tool touches nothing, the tip {1e3 * away:.1f} mm from the target"

@@ -377,15 +377,8 @@ class TeleopChannel(LeafSystem):
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.step_addresses(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
-        self._constants = (
-            *(
-                period,
-                channel.timeout_s(period),
-                np.concatenate([R_WB.ravel(), scales]),
-                parameters,
-            ),
-            *lines,
-        )
+        frame = np.concatenate([R_WB.ravel(), scales])
+        self._constants = (period, channel.timeout_s(period), frame, parameters, *lines)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)

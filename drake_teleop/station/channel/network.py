@@ -145,17 +145,12 @@ def network_parameters(
     p[_PERIOD], p[_JITTER] = period, config.jitter
     p[_MEAN_DELAY_STEPS], p[_MAX_DELAY_STEPS] = mean, longest
     p[_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
-    p[_BAD_SHARE], p[_BAD_PERSISTENCE] = (
-        bad,
-        math.exp(-period / time_constant) if time_constant > 0 else 0.0,
-    )
+    p[_BAD_SHARE] = bad
+    p[_BAD_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
     p[_BURST_LOSS], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
     p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
-    p[_PLAYOUT_STEPS], p[_IS_REDUNDANT], p[_NUM_TRANSIT_SLOTS] = (
-        playout,
-        config.redundant,
-        max(longest, playout) + 1,
-    )
+    p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
+    p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
     p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), least
     p[_TRACE_START:] = trace
     return p

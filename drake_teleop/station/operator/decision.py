@@ -94,11 +94,8 @@ def pack_operator_parameters(
 
 def pack_task_parameters(task: Task) -> Array:
     packed = np.zeros(_TASK_SIZE)
-    packed[[_TASK_KIND, _T_START, _TIMEOUT]] = (
-        TASK_CLASSES.index(type(task)),
-        task.t_start,
-        task.timeout,
-    )
+    packed[_TASK_KIND] = TASK_CLASSES.index(type(task))
+    packed[[_T_START, _TIMEOUT]] = task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
     packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.target_distance
     if isinstance(task, Reach):
@@ -242,10 +239,8 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     """
     step = int(memory[_STEP_COUNT])
     memory[_STEP_COUNT] += 1.0
-    state[CONTACT_PERCEIVED_INDEX], state[FORCE_THRESHOLD_INDEX] = (
-        felt[CONTACT_NOTICED_INDEX],
-        felt[DETECTION_THRESHOLD_INDEX],
-    )
+    state[CONTACT_PERCEIVED_INDEX] = felt[CONTACT_NOTICED_INDEX]
+    state[FORCE_THRESHOLD_INDEX] = felt[DETECTION_THRESHOLD_INDEX]
     # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
     if person[_FORCE_GAIN] > 0.0:
@@ -277,11 +272,9 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_target_into(task, person, out):
-    depth = (
-        0.0
-        if task[_TASK_KIND] == KIND_REACH
-        else person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
-    )
+    depth = 0.0
+    if task[_TASK_KIND] != KIND_REACH:
+        depth = person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
         if task[_TASK_KIND] == KIND_INSERT and i < 2:

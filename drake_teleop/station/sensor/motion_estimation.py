@@ -345,11 +345,8 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
     period = constants[_PERIOD_INDEX]
     fused = constants[_USE_FUSION_INDEX] != 0.0
     starts = memory[0] == 0.0
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     R_SA, R = matrix_at(constants, _ACCELEROMETER_AXES), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
