@@ -73,14 +73,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     if scenario.contact_detection is not None:
         builder.ExportInput(channel.GetInputPort("contact"), "contact")
         export_outputs(builder, channel, "contact_at_hand")
-    export_outputs(
-        builder,
-        channel,
-        "pose_received",
-        "ports",
-        pose_to_slave="pose_received",
-        wrench_to_master="wrench_received",
-    )
+    export_outputs(builder, channel, "pose_received", "ports", pose_to_slave="pose_received")
+    export_outputs(builder, channel, wrench_to_master="wrench_received")
     return builder.Build()
 
 

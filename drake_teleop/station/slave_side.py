@@ -111,16 +111,10 @@ def MakeSlaveSide(
         builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
-    force_scaling = builder.AddNamedSystem(
-        "force_scaling",
-        ForceScaling(
-            scenario.force_scaling,
-            arm,
-            R_WB,
-            scenario.wrist_sensor.largest_plausible_wrench(),
-            max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz),
-        ),
-    )
+    largest = scenario.wrist_sensor.largest_plausible_wrench()
+    max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
+    scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)
+    force_scaling = builder.AddNamedSystem("force_scaling", scaling)
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample_ports["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
@@ -150,12 +144,9 @@ def MakeSlaveSide(
                 remedy="pass noise_floor=identify_load(...).noise_floor",
             )
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
-        detection = builder.AddNamedSystem(
-            "contact_detection",
-            ContactDetection(
-                scenario.contact_detection, noise_floor, arm, 1 / scenario.rates.estimator_hz
-            ),
-        )
+        period = 1 / scenario.rates.estimator_hz
+        detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
+        builder.AddNamedSystem("contact_detection", detection)
         builder.Connect(body.sample_ports["sample"], detection.GetInputPort("sample"))
         builder.Connect(estimate, detection.GetInputPort("load_estimate"))
         export_outputs(builder, detection, "contact")
@@ -262,15 +253,9 @@ def _add_slave_blocks(
     monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, SLAVE_MONITOR_PERIOD_S))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
+    motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
     sample = AddCompiledWristSensor(
-        builder,
-        slave,
-        sensor,
-        scenario.motion_estimation,
-        1 / rates.sensor_hz,
-        held,
-        start,
-        ramps=ramps,
+        builder, slave, sensor, motion, sensor_period, held, start, ramps=ramps
     )
     wrist = builder.GetSubsystemByName("wrist_sensor")
     acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
@@ -286,21 +271,17 @@ def _add_slave_blocks(
     for name, port in sample.items():
         builder.ExportOutput(port, name)
 
-    estimator = builder.AddNamedSystem(
-        "load_estimator",
-        LoadEstimator(
-            scenario.load_estimator,
-            sensor.wrench_std(),
-            estimated_motion_std(
-                scenario.motion_estimation, sensor, arm.num_joints, 1 / rates.sensor_hz
-            ),
-            1 / rates.estimator_hz,
-            sample["sample"].size(),
-            np.zeros(16) if load_estimate is None else load_estimate,
-            load_covariance,
-            scenario.force_scaling.gripper_phi,
-        ),
+    estimator = LoadEstimator(
+        scenario.load_estimator,
+        sensor.wrench_std(),
+        estimated_motion_std(motion, sensor, arm.num_joints, sensor_period),
+        1 / rates.estimator_hz,
+        sample["sample"].size(),
+        np.zeros(16) if load_estimate is None else load_estimate,
+        load_covariance,
+        scenario.force_scaling.gripper_phi,
     )
+    builder.AddNamedSystem("load_estimator", estimator)
     # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))

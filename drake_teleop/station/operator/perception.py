@@ -115,13 +115,8 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     noticed = attentive and math.sqrt(excess_square) >= out[DETECTION_THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        _update_force_model(
-            theta,
-            memory[_COVARIANCE_START:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS),
-            rows,
-            excess,
-            dt,
-        )
+        P = memory[_COVARIANCE_START:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS)
+        _update_force_model(theta, P, rows, excess, dt)
 
 
 @njit(cache=True)

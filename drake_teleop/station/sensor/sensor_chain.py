@@ -163,14 +163,8 @@ class WristSensorConfig:
 
     def ranges(self) -> NDArray[np.float64]:
         """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
-        return np.concatenate(
-            [
-                self.force_range,
-                self.torque_range,
-                np.full(3, self.acceleration_range),
-                np.full(3, self.angular_acceleration_range),
-            ]
-        )
+        motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
+        return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
     def largest_plausible_wrench(self) -> NDArray[np.float64]:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
@@ -267,13 +261,8 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
         damping = 2 * np.cos(angle) * warped
         a0 = 1 + damping + warped**2
-        sections[row] = (
-            warped**2 / a0,
-            2 * warped**2 / a0,
-            warped**2 / a0,
-            2 * (warped**2 - 1) / a0,
-            (1 - damping + warped**2) / a0,
-        )
+        b0, a1, a2 = warped**2, 2 * (warped**2 - 1), 1 - damping + warped**2
+        sections[row] = np.array([b0, 2 * b0, b0, a1, a2]) / a0
     return sections
 
 

@@ -157,13 +157,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(
-            sample,
-            SAMPLE_WRENCH_AND_MOTION.start,
-            truth,
-            SAMPLE_WRENCH_AND_MOTION.start,
-            SAMPLE_WRENCH_AND_MOTION.stop,
-        )
+        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
         sample[SATURATION_FLAG_INDEX] = 0.0
         copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
     else:
@@ -568,12 +562,9 @@ def AddCompiledWristSensor(
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
     if not config.ideal:
-        noise = builder.AddNamedSystem(
-            "wrist_sensor_noise",
-            RandomSource(
-                RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, SAMPLES_PER_NOISE_BLOCK * period
-            ),
-        )
+        block_s = SAMPLES_PER_NOISE_BLOCK * period
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
+        builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     if slave.sheet_in_compiled_law is not None:
         builder.Connect(
