@@ -147,10 +147,8 @@ def _check_limits(
             full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
-        yield (
-            "the device displays its largest force or torque",
-            find_spans(t, full, _MIN_SPAN_S),
-        )
+        spans = find_spans(t, full, _MIN_SPAN_S)
+        yield "the device displays its largest force or torque", spans
         ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
@@ -166,11 +164,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
-        silent = result[f"ports.{end}_silent"] > timeout
-        yield (
-            f"the {end}'s end is in its safe state, no packets arrive from the {other},",
-            find_spans(t, silent, _MIN_SPAN_S),
-        )
+        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_SPAN_S)
+        yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
@@ -186,10 +181,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         )
     yield from _check_reserve_speed_limit(result, scenario)
     oscillating = flag_unexplained_pose_oscillation(t, sent, received, REVERSAL_DELAY_S + window)
-    yield (
-        f"the channel ({by}) makes the slave's command oscillate",
-        find_spans(t, oscillating, _MIN_SPAN_S),
-    )
+    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
 def _check_reserve_speed_limit(
@@ -200,15 +193,12 @@ def _check_reserve_speed_limit(
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * slave_wrench_power_scale(
-        scenario
-    )
-    limit = speed_limit(config, mass)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
+    limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
     then = t - _newest_packet_ages_s(t, scenario)
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_S
-    for g, (command, actual, least, unit, scale) in enumerate(
-        _position_and_rotation_parts(sent, received)
-    ):
+    parts = _position_and_rotation_parts(sent, received)
+    for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
@@ -233,10 +223,10 @@ def _check_reserve_speed_limit(
 def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    rotations = (quaternions_as_angles(pose, command) for pose in (command, actual))
+    wanted, turned = (quaternions_as_angles(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
-        (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
+        (wanted, turned, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     )
 
 
@@ -270,10 +260,8 @@ def _check_joint_tracking(
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
     oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
-    yield (
-        "the slave oscillates while its command does not,",
-        find_spans(t, oscillating, _MIN_SPAN_S),
-    )
+    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    yield "the slave oscillates while its command does not,", spans
 
 
 def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
@@ -281,10 +269,8 @@ def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spa
         oscillating = flag_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], REVERSAL_DELAY_S
         )
-        yield (
-            "the hand oscillates while its intent does not,",
-            find_spans(result.t, oscillating, _MIN_SPAN_S),
-        )
+        spans = find_spans(result.t, oscillating, _MIN_SPAN_S)
+        yield "the hand oscillates while its intent does not,", spans
 
 
 def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Spans]]:

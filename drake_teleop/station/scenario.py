@@ -301,12 +301,8 @@ def _check_task(scenario: Scenario, where: str) -> None:
 
 def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
-    controlled = simulation.integrator == "runge_kutta3"
-    if (
-        scenario.surroundings is not None
-        and not controlled
-        and simulation.max_step > _MAX_CONTACT_STEP_S
-    ):
+    fixed = simulation.integrator != "runge_kutta3"
+    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_CONTACT_STEP_S:
         raise DrakeTeleopError(
             f"fixed steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",

@@ -185,13 +185,10 @@ def _read_delay_trace(path: Path, period: float) -> NDArray[np.float64]:
         what = f"has {len(delay)} values, the column time has {len(time)}"
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
+    too_late = f"is more than {MAX_TRACE_DURATION_S:g} s after the first"
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
-        (
-            "time",
-            age > MAX_TRACE_DURATION_S,
-            f"is more than {MAX_TRACE_DURATION_S:g} s after the first",
-        ),
+        ("time", age > MAX_TRACE_DURATION_S, too_late),
         ("delay", (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():

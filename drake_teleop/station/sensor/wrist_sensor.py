@@ -513,17 +513,14 @@ class WristSensor(LeafSystem):
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
         physics = self._physics
-        if (
-            self.reason_beyond_contact_law
-            or self._tool_proximity(state, around) == PROXIMITY_NEAR_MONITORED
-        ):
+        near = self._tool_proximity(state, around)
+        if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
             applied = applied + self._plant_contact_wrench_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
-        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ACCELERATION_TOLERANCE * (
-            1.0 + np.abs(vdot).max()
-        ):
+        error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
+        if not error < _ACCELERATION_TOLERANCE * (1.0 + size):
             raise DrakeTeleopError(
                 f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
                 "not receive it",
