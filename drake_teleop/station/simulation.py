@@ -151,13 +151,16 @@ class LogOnDisk:
     def write_and_clear(self) -> None:
         """Write the rows in memory as the next part and clear them; safe to repeat."""
         part = self._read_rows()
-        part.write_part(self._folder, self._rows)
+        self._write_part(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
     def write_and_keep(self) -> None:
         """Write the rows in memory but keep them; a later part replaces them."""
-        self._read_rows().write_part(self._folder, self._rows)
+        self._write_part(self._read_rows())
+
+    def _write_part(self, part: SimulationResult) -> None:
+        part.write_part(self._folder, self._rows)
 
     def _read_rows(self) -> SimulationResult:
         return self._form(read_recorded_signals(self._simulator, self._start))
