@@ -300,9 +300,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
-        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
-        moving = {pose.ticket(), twist.ticket(), self.time_ticket()}
+        moving = self._declare_intended_motion() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task requires the arguments training, arm and tip")
@@ -310,6 +308,11 @@ class Operator(LeafSystem):
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+
+    def _declare_intended_motion(self) -> set[DependencyTicket]:
+        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        return {pose.ticket(), twist.ticket()}
 
     def _declare_task(
         self,
