@@ -129,17 +129,17 @@ def _inner_block_lines(entry: FieldInfo) -> list[str]:
         return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _comment_out_lines(_field_lines(entry, blocks))
-    return [line for block in blocks for line in _comment_out_lines(_field_lines(entry, block))]
+        return _prefix_lines("# ", _field_lines(entry, blocks))
+    return [line for block in blocks for line in _prefix_lines("# ", _field_lines(entry, block))]
 
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.lists:
         head = f"{entry.name}:{_tag_of_block(entry, value)}  # {entry.meaning}"
-        return [head, *_indent(_block_lines(value))]
+        return [head, *_prefix_lines("  ", _block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag_of_block(entry, item)}", *_indent(_indent(_block_lines(item)))]
+        lines += [f"  -{_tag_of_block(entry, item)}", *_prefix_lines(" " * 4, _block_lines(item))]
     return lines
 
 
@@ -147,12 +147,8 @@ def _tag_of_block(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
-def _indent(lines: list[str]) -> list[str]:
-    return [f"  {line}" for line in lines]
-
-
-def _comment_out_lines(lines: list[str]) -> list[str]:
-    return [f"# {line}" for line in lines]
+def _prefix_lines(prefix: str, lines: list[str]) -> list[str]:
+    return [prefix + line for line in lines]
 
 
 def _sections_of_page(config: Any, path: str) -> Iterator[str]:

@@ -175,14 +175,11 @@ def _add_inverse_kinematics(
     arm = body.slave.arm
     make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
     make_ik = JointFollower if led else make_ik
-    ik = builder.AddNamedSystem(
-        "inverse_kinematics", make_ik(arm, body.slave.start, body.command_period_s)
-    )
+    ik = make_ik(arm, body.slave.start, body.command_period_s)
+    builder.AddNamedSystem("inverse_kinematics", ik)
     if not led:
         builder.Connect(body.sample_ports["joint_position"], ik.GetInputPort("joint_position"))
-    builder.Connect(
-        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
-    )
+    connect_ports(builder, ik, "joint_command", body.joint_control, "joint_command")
     builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
     export_outputs(builder, ik, "joint_command")
     export_outputs(builder, body.monitor, "ik_status")
@@ -198,12 +195,9 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
     body = _add_slave_blocks(builder, scenario, q_start=start)
-    command = builder.AddNamedSystem(
-        "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
-    )
-    builder.Connect(
-        command.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
-    )
+    command = JointTrajectory(trajectory, scenario.simulation.settle)
+    builder.AddNamedSystem("joint_trajectory", command)
+    connect_ports(builder, command, "joint_command", body.joint_control, "joint_command")
     export_outputs(builder, command, "joint_command")
     return builder.Build()
 
