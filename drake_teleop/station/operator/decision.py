@@ -396,6 +396,12 @@ def _is_tool_stuck(task, person, felt):
 
 
 @njit(cache=True)
+def _spiral_coordinate(n, k):
+    radius = _SEARCH_SPIRAL_SCALE_M * math.sqrt(n)
+    return radius * math.cos(_GOLDEN_ANGLE_RAD * n - 0.5 * math.pi * k)
+
+
+@njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
@@ -415,14 +421,7 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         n = memory[_SEARCHES]
         memory[_SEARCHES] += 1.0
         for k in range(2):
-            before = (
-                _SEARCH_SPIRAL_SCALE_M
-                * math.sqrt(n)
-                * math.cos(_GOLDEN_ANGLE_RAD * n - 0.5 * math.pi * k)
-            )
-            now = _SEARCH_SPIRAL_SCALE_M * math.sqrt(n + 1)
-            now *= math.cos(_GOLDEN_ANGLE_RAD * (n + 1) - 0.5 * math.pi * k)
-            move[k] = now - before
+            move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
     for i in range(3):
         move[i] += push * task[_AXIS + i]
