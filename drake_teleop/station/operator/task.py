@@ -31,25 +31,26 @@ class Reach(_Task):
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "required time in the target")
 
 
-@settings
 @dataclass
-class Touch(_Task):
-    """Task: approach a surface at the target, detect contact, and stop."""
-
+class _ContactTask(_Task):
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
     )
+
+
+@settings
+@dataclass
+class Touch(_ContactTask):
+    """Task: approach a surface at the target, detect contact, and stop."""
+
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest after the stop")
 
 
 @settings
 @dataclass
-class Press(_Task):
+class Press(_ContactTask):
     """Task: approach a surface at the target and press on it with a set force."""
 
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
     force: float = quantity(8.0, "N", 0.1, 500.0, "set force of the tool on the surface")
     tolerance: float = quantity(2.0, "N", 0.05, 100.0, "tolerance of the set force")
     hold: float = quantity(1.0, "s", 0.0, 60.0, "duration of the set force")
@@ -57,13 +58,10 @@ class Press(_Task):
 
 @settings
 @dataclass
-class Insert(_Task):
+class Insert(_ContactTask):
     """Task: insert the tool into a slot with its mouth at the target, down to the slot's floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "time after which the operator gives up")
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
     depth: float = quantity(0.04, "m", 1e-3, 0.5, "depth of the slot")
     push: float = quantity(10.0, "N", 0.1, 500.0, "downward force of the tool in the slot")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest on the floor")

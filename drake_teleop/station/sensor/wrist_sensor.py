@@ -564,16 +564,13 @@ def AddCompiledWristSensor(
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     if slave.sheet_in_compiled_law is not None:
-        builder.Connect(
-            slave.plant.get_state_output_port(slave.sheet_in_compiled_law),
-            sensor.GetInputPort("sheet_state"),
-        )
+        sheet = slave.plant.get_state_output_port(slave.sheet_in_compiled_law)
+        builder.Connect(sheet, sensor.GetInputPort("sheet_state"))
     if slave.contact.plant_size:
         builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
     if slave.can_touch:
-        builder.Connect(
-            slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
-        )
+        results = slave.plant.get_contact_results_output_port()
+        builder.Connect(results, sensor.GetInputPort("contact_results"))
     parts = signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
