@@ -36,6 +36,7 @@ from drake_teleop.station.slave.posture_shapes import start_overlaps
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
+Warnings = Iterator[tuple[str, Spans]]
 
 _MIN_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
@@ -106,7 +107,7 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
 
 
-def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_faults(result: SimulationResult) -> Warnings:
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -119,9 +120,7 @@ def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
             yield f"a fault: {meaning},", find_spans(t, happened)
 
 
-def _check_limits(
-    result: SimulationResult, scenario: Scenario, arm: ArmModel
-) -> Iterator[tuple[str, Spans]]:
+def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t = result.t
     flag = result["saturated"][:, 0]
     yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
@@ -159,7 +158,7 @@ def _check_limits(
         )
 
 
-def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     if "ports" not in result:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
@@ -185,9 +184,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
-def _check_reserve_speed_limit(
-    result: SimulationResult, scenario: Scenario
-) -> Iterator[tuple[str, Spans]]:
+def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> Warnings:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return
@@ -241,17 +238,13 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joint_tracking(
-    result: SimulationResult, scenario: Scenario, arm: ArmModel
-) -> Iterator[tuple[str, Spans]]:
+def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = (
-        _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
-        + 1 / scenario.rates.joint_control_hz
-    )
+    window = _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
@@ -264,7 +257,7 @@ def _check_joint_tracking(
     yield "the slave oscillates while its command does not,", spans
 
 
-def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
         oscillating = flag_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], REVERSAL_DELAY_S
@@ -273,7 +266,7 @@ def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spa
         yield "the hand oscillates while its intent does not,", spans
 
 
-def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if "true_contact_wrench_W" not in result:
         return
     force = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
@@ -290,7 +283,7 @@ def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Span
         )
 
 
-def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_rendered_force(result: SimulationResult) -> Warnings:
     if not {"ports", "intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
