@@ -173,7 +173,8 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             loss=case["loss"],
             burst=case["burst"],
         )
-        travel = network.packet_delays(line, case["seed"], way, STEPS, PERIOD)[:, 0]
+        p = network.network_parameters(line, case["seed"], way, PERIOD)
+        travel = network.packet_delays(p, STEPS)[:, 0]
         lost = travel < 0
         turns = TIME / case["delay_pace"]
         later = {

@@ -32,10 +32,10 @@ from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     WristSensorConfig,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
 )
 from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.station import MakeTeleopStation
@@ -72,8 +72,8 @@ def _read_often(constants, memory, noise, truth, reading, count):  # type: ignor
 def reading(config: WristSensorConfig) -> tuple[float, float]:
     """One sample of six joints through the chain, and the same interpreted [s]."""
     rng = np.random.default_rng(0)
-    constants, memory = sensor_chain_constants(config, 6, PERIOD)
-    noise = rng.standard_normal(NOISE_SIZE)
+    constants, memory = initialize_sensor_chain(config, 6, PERIOD)
+    noise = rng.standard_normal(NOISE_BLOCK_SIZE)
     rest = constants, memory, noise, rng.normal(size=21), np.empty(19)
     ours = seconds(lambda: _read_often(*rest, 2000), 5) / 2000
     return ours, seconds(lambda: read_sensor_into.py_func(*rest), 20)

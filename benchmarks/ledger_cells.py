@@ -50,7 +50,7 @@ from drake_teleop.station.operator.operator import (
     OperatorConfig,
     Sine,
 )
-from drake_teleop.station.oscillation import high_pass
+from drake_teleop.station.oscillation import high_pass_above_5_hz
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
@@ -307,7 +307,7 @@ def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict
     out = before / max(float(np.linalg.norm(before)), 1e-9)
     free = (hand[at : at + 2000] - hand[at]) @ out
     away = int(np.searchsorted(t, times.left))
-    fast = high_pass(t[held], rendered[held])
+    fast = high_pass_above_5_hz(t[held], rendered[held])
     return {
         "pressed_N": float(np.linalg.norm(pressed)),
         "energy_J": float(energy.min()),

@@ -31,15 +31,15 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
-    motion_estimator,
+    initialize_motion_estimator,
     path_delays,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     WristSensorConfig,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
@@ -124,11 +124,13 @@ class Record:
     ) -> tuple[Array, float]:
         """The samples (N, 16 + n) after the start, and the microseconds that one takes."""
         n = self.truth.shape[1] - 15
-        noise = np.random.default_rng(0).standard_normal((len(self.truth) // 32 + 1, NOISE_SIZE))
+        noise = np.random.default_rng(0).standard_normal(
+            (len(self.truth) // 32 + 1, NOISE_BLOCK_SIZE)
+        )
         readings = np.empty((len(self.truth), 13 + n))
         samples = np.empty((len(self.truth), 16 + n))
-        read(*sensor_chain_constants(sensor, n, T), noise, self.truth, readings)
-        constants, memory = motion_estimator(config, believed or sensor, n, T)
+        read(*initialize_sensor_chain(sensor, n, T), noise, self.truth, readings)
+        constants, memory = initialize_motion_estimator(config, believed or sensor, n, T)
         begin = time.thread_time()
         estimate(constants, memory, self.arm.table, readings, samples)
         return samples[SETTLED:], (time.thread_time() - begin) / len(samples) * 1e6
@@ -147,7 +149,7 @@ class Record:
             "rms": rms(wrench[:, :3]),
             "peak": float(np.linalg.norm(wrench[:, :3], axis=1).max()),
             "torque_rms": rms(wrench[:, 3:]),
-            "delay_ms": 1e3 * path_delays(config, sensor, T).sample,
+            "delay_ms": 1e3 * path_delays(config, sensor, T).sample_s,
             "microseconds": microseconds,
         }
 

@@ -286,14 +286,14 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             if saturates:
                 p[WRENCH_LIMIT] = 0.5, 0.01
             own = method == WAVE_HOLD
-            steps_of = _OWN_STEPS if own else methods.steps_of(method)
+            step_addresses = _OWN_STEPS if own else methods.step_addresses(method)
             start = initial_method_memory("none" if own else method, p, POSE)
             initial = start[STORED_ENERGY]
             memories = np.stack([start, start])
             at_motors = not own and METHODS[method].balance_at_motors
             began = time.thread_time()
             _run(
-                steps_of, at_motors, p, memories, newest, motion, poses,
+                step_addresses, at_motors, p, memories, newest, motion, poses,
                 wrench, PERIOD, sent, figures,
             )  # fmt: skip
             seconds[name] += time.thread_time() - began

@@ -41,14 +41,17 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station import scenario as scenarios
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.sensor.motion_estimation import estimate_sample_into, motion_estimator
+from drake_teleop.station.sensor.motion_estimation import (
+    estimate_sample_into,
+    initialize_motion_estimator,
+)
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     PARTS,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.simulation import simulate
@@ -66,7 +69,7 @@ LATE = 1e-3
 
 
 def true_motions() -> tuple[Array, Array, FourierTrajectory]:
-    """Return the true values at 8 kHz (N, 15 + n), see `sensor_chain_constants`: both motions."""
+    """Return the true values at 8 kHz (N, 15 + n), see `initialize_sensor_chain`: both motions."""
     ideal = {"wrist_sensor__ideal": True, "rates__log_hz": RATE}
     found = identify_load(scenarios.replace(IDENTIFICATION, **ideal))
     swing = scenarios.replace(SWING, **ideal)
@@ -101,10 +104,12 @@ def sampled(
         believed: what the estimation of the motion takes it for.
     """
     n = truth.shape[1] - 15
-    chain, memory = sensor_chain_constants(sensor, n, 1 / RATE)
-    motion = motion_estimator(IDENTIFICATION.motion_estimation, believed or sensor, n, 1 / RATE)
+    chain, memory = initialize_sensor_chain(sensor, n, 1 / RATE)
+    motion = initialize_motion_estimator(
+        IDENTIFICATION.motion_estimation, believed or sensor, n, 1 / RATE
+    )
     blocks = len(truth) // SAMPLES_PER_NOISE_BLOCK + 1
-    noise = np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
+    noise = np.random.default_rng(seed).standard_normal((blocks, NOISE_BLOCK_SIZE))
     samples = np.empty((len(truth), 16 + n))
     _run(chain, memory, *motion, ARM.table, noise, truth, samples)
     wrench, s, omega, alpha, _ = np.split(samples, [6, 9, 12, 15], axis=1)

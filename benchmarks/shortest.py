@@ -36,12 +36,15 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.sensor.motion_estimation import estimate_sample_into, motion_estimator
+from drake_teleop.station.sensor.motion_estimation import (
+    estimate_sample_into,
+    initialize_motion_estimator,
+)
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 
@@ -74,15 +77,15 @@ def reached(
     write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
-    constants, memory = sensor_chain_constants(noisy, joints[0].shape[1], period)
-    estimator, remembered = motion_estimator(
+    constants, memory = initialize_sensor_chain(noisy, joints[0].shape[1], period)
+    estimator, remembered = initialize_motion_estimator(
         scenario.motion_estimation, noisy, joints[0].shape[1], period
     )
     samples, within = np.empty((len(truth), 22)), 0
     rng = np.random.default_rng(0)
     true, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
     for _ in range(records):
-        noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 
 pytestmark = pytest.mark.checks
 
@@ -42,7 +42,7 @@ def benchmark() -> ModuleType:
 # Painting takes longest; the benchmark does it.
 NO_PICTURES = """
 from matplotlib.figure import Figure
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 painted = Figure.savefig
 Figure.savefig = lambda _, path, **options: painted(Figure(figsize=(0.1, 0.1)), path, **options)
 ReplayFile._record_scene = lambda self, make_scene: "<body></body>"

@@ -13,7 +13,7 @@ from pydrake.geometry import Meshcat
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import true_load
-from drake_teleop.station import film, replay
+from drake_teleop.station import replay, replay_file
 from drake_teleop.station.replay import ReplayScene, replay_command, write_replay
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -46,7 +46,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def __init__(self, meshcat, name, colour):
             self.name = name
 
-        def show_force(self, canvas, film_time, place, force):
+        def show_force(self, canvas, replay_time, place, force):
             shown[self.name] = force
 
     monkeypatch.setattr(replay, "ForceArrow", Arrow)
@@ -208,10 +208,10 @@ def test_replay_has_fifty_frames_per_second(
         def __init__(self, meshcat, scenario, recorded):
             self.meshcat = meshcat
 
-        def show_sample(self, film_time, signals, sample):
-            kept[np.floor(film_time * self.meshcat.rate)] = signals["slave_state"][sample]
+        def show_sample(self, replay_time, signals, sample):
+            kept[np.floor(replay_time * self.meshcat.rate)] = signals["slave_state"][sample]
 
-    monkeypatch.setattr(film, "Meshcat", Recorder)
+    monkeypatch.setattr(replay_file, "Meshcat", Recorder)
     monkeypatch.setattr(replay, "ReplayScene", Scene)
     write_replay(tmp_path / "replay.html", result, scenario, slow_motion=slow_motion)
     assert list(kept) == list(range(frames))
@@ -228,7 +228,7 @@ def test_meshcat_server_is_stopped_after_writing(tmp_path, result, scenario, mon
         ports.append(meshcat.port())
         return meshcat
 
-    monkeypatch.setattr(film, "Meshcat", remember)
+    monkeypatch.setattr(replay_file, "Meshcat", remember)
     replay.write_replay(tmp_path / "replay.html", result, scenario)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("localhost", ports[0]))

@@ -10,7 +10,6 @@ import pytest
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
-from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.phantom import (
     FORCE_LIMIT,
@@ -19,7 +18,11 @@ from drake_teleop.station.master.phantom import (
     jacobian_into,
 )
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
-from drake_teleop.station.oscillation import find_reversals, find_unexplained_oscillation
+from drake_teleop.station.oscillation import (
+    find_chatter,
+    flag_unexplained_oscillation,
+    reversal_indices,
+)
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
@@ -231,20 +234,20 @@ def test_lag_excludes_delay_and_low_pass(delay):
 
 def test_reversals_are_extremes_beyond_the_swing():
     x = np.sin(2 * np.pi * T) + 0.01 * np.sin(2 * np.pi * 50 * T)
-    np.testing.assert_allclose(T[find_reversals(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
-    assert len(find_reversals(x, 0.005)) > 50
-    assert len(find_reversals(np.zeros(10), 0.1)) == len(find_reversals(T, 0.1)) == 0
+    np.testing.assert_allclose(T[reversal_indices(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
+    assert len(reversal_indices(x, 0.005)) > 50
+    assert len(reversal_indices(np.zeros(10), 0.1)) == len(reversal_indices(T, 0.1)) == 0
 
 
 def test_following_an_oscillating_command_is_no_oscillation():
     command = 0.066 * np.sin(2 * np.pi * 2.63 * T)[:, np.newaxis]
     follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
-    assert not find_unexplained_oscillation(T, command, follows, 5e-4).any()
-    assert find_unexplained_oscillation(T, 0 * command, follows, 5e-4).mean() > 0.8
+    assert not flag_unexplained_oscillation(T, command, follows, 5e-4).any()
+    assert flag_unexplained_oscillation(T, 0 * command, follows, 5e-4).mean() > 0.8
     slow = 0.02 * np.sin(2 * np.pi * 2 * T)[:, np.newaxis]
     shaken = slow.copy()
     shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
-    found = T[find_unexplained_oscillation(T, slow, shaken, 5e-4)]
+    found = T[flag_unexplained_oscillation(T, slow, shaken, 5e-4)]
     assert 0.95 < found[0] < 1.1
     assert 1.9 < found[-1] < 2.05
     assert len(found) > 800

@@ -22,7 +22,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.table_files import read_table
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
@@ -68,7 +68,7 @@ LISTENS = re.compile(
     r"|\bserve\("
 )
 LISTENING = {
-    ("station/film.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
+    ("station/replay_file.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("lab/studies/processes.py", "Client("),
     # Who is let in: tests/live/test_server.py.
     ("live/page_scene.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),

@@ -19,7 +19,7 @@ from drake_teleop.station.operator.decision import (
     STATE_SIZE,
 )
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Touch
+from drake_teleop.station.operator.task import TASK_MEASURE_NAMES, Insert, Press, Reach, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.signals import SIGNALS
@@ -72,7 +72,7 @@ def run(
 
 def test_measures_of_a_touch():
     found = measures(Touch(t_start=START + SETTLE))
-    assert tuple(found) == TASK_MEASURES
+    assert tuple(found) == TASK_MEASURE_NAMES
     assert found["success"] == 1.0
     assert found["task_time_s"] == pytest.approx(END - START)
     assert found["contact_force_overshoot_N"] == pytest.approx(6.0)
@@ -100,7 +100,7 @@ def test_failed_task_has_nan_measures():
     ):
         assert found["success"] == 0.0
         missing = {name for name, value in found.items() if math.isnan(value)}
-        assert missing == set(TASK_MEASURES) - {"success", "detection_time_s", "false_notices"}
+        assert missing == set(TASK_MEASURE_NAMES) - {"success", "detection_time_s", "false_notices"}
 
 
 def test_measures_of_a_given_up_task():

@@ -31,7 +31,7 @@ from drake_teleop.lab import run as runs
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.logs import sample
 from drake_teleop.station import replay
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 

@@ -17,12 +17,12 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
 )
 
 _CHANNELS = 12
@@ -103,11 +103,11 @@ def rest_record(
         period: sampling period [s].
         seed: of the noise.
     """
-    constants, memory = sensor_chain_constants(config, 1, period)
+    constants, memory = initialize_sensor_chain(config, 1, period)
     truth = np.zeros(16)
     truth[8] = 9.81
     noise = np.random.default_rng(seed).standard_normal(
-        (-(-count // SAMPLES_PER_NOISE_BLOCK), NOISE_SIZE)
+        (-(-count // SAMPLES_PER_NOISE_BLOCK), NOISE_BLOCK_SIZE)
     )
     record = np.empty((count, _CHANNELS))
     _record_into(constants, memory, noise, truth, record)

@@ -13,8 +13,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.errors import to_one_line
-from drake_teleop.station.film import silence_drake_log
 from drake_teleop.station.replay import ReplayScene
+from drake_teleop.station.replay_file import silence_drake_log
 from drake_teleop.station.scenario import Scenario
 
 LogRows = dict[str, NDArray[np.float64]]

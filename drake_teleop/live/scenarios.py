@@ -143,7 +143,7 @@ def _sensor_offset(scenario: Scenario) -> Array:
 
 def channel_fill_time(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
-    if scenario.is_direct:
+    if scenario.has_direct_channel:
         return 0.0
     return (
         sum(longest_delay(line) for line in scenario.channel.networks_of_directions())

@@ -42,7 +42,7 @@ from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_of
 from drake_teleop.station.simulation import (
     MakeSimulator,
     advance_without_garbage_collection,
-    log_columns,
+    log_slices_of_signals,
     read_recorded_signals,
 )
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
@@ -127,7 +127,7 @@ class _Station:
             take_short_steps_in_contact(self.simulator, _MIN_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
-        self.columns = log_columns(self.station)
+        self.columns = log_slices_of_signals(self.station)
 
     def block_and_context(self, name: str) -> tuple[Any, Context]:
         inner_side = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
@@ -163,11 +163,11 @@ class _Station:
             hand.SetImpedance(context, *impedances)
         if not new_channel:
             return 0.0
-        name = "pose_command" if other.scenario.is_direct else "pose_received"
+        name = "pose_command" if other.scenario.has_direct_channel else "pose_received"
         command = other.signal_value(name)
         scaling, context = self.block_and_context("kinematic_scaling")
         scaling.OpenClutch(context, command)
-        if not self.scenario.is_direct:
+        if not self.scenario.has_direct_channel:
             channel, context = self.block_and_context("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))

@@ -44,7 +44,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
-    if scenario.is_direct:
+    if scenario.has_direct_channel:
         wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]
         if scenario.contact_detection is not None:
             wires.append(("contact", "contact_at_hand", 1))
@@ -73,14 +73,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     if scenario.contact_detection is not None:
         builder.ExportInput(channel.GetInputPort("contact"), "contact")
         export_outputs(builder, channel, "contact_at_hand")
-    export_outputs(
-        builder,
-        channel,
-        "pose_received",
-        "ports",
-        pose_to_slave="pose_received",
-        wrench_to_master="wrench_received",
-    )
+    export_outputs(builder, channel, "pose_received", "ports", pose_to_slave="pose_received")
+    export_outputs(builder, channel, wrench_to_master="wrench_received")
     return builder.Build()
 
 
@@ -123,7 +117,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def power_scale_of_scenario(scenario: Scenario) -> Array:
+def slave_wrench_power_scale(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_force_scale(scenario) / np.where(scales > 0.0, scales, 1.0)

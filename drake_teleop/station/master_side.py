@@ -73,15 +73,13 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     export_outputs(builder, operator, "intent", "hand_wrench_E")
     export_outputs(builder, device, "pose_master", "twist_master", master_state="state")
 
+    coupling: JointCoupling | KinematicScaling
     if isinstance(model, LeaderDevice) and scenario.master.is_joint_leader:
         slave = NominalSlave(scenario.slave)
-        kinematic_scaling = builder.AddNamedSystem(
-            "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD_S)
-        )
+        coupling = JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD_S)
     else:
-        kinematic_scaling = builder.AddNamedSystem(
-            "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD_S, start_W)
-        )
+        coupling = KinematicScaling(scaling, CLUTCH_PERIOD_S, start_W)
+    kinematic_scaling = builder.AddNamedSystem("kinematic_scaling", coupling)
     read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
     if scenario.master.encoder_steps().any() and isinstance(model, HapticDevice):
         encoders = Encoders(model, q_start, scenario.master.encoder_steps())

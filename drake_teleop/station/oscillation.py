@@ -1,25 +1,40 @@
-"""Detection of oscillations in recorded signals that the commanded motion does not explain."""
+"""Oscillations and contact chatter in recorded signals that the command does not explain.
+
+Chatter: the tool loses and regains contact several times a second.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
 _MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
-REVERSAL_WINDOW_S = 0.25
+REVERSAL_DELAY_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
-MAX_HIGH_FREQUENCY_FORCE_N = 0.05
+MAX_FORCE_RIPPLE_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
+# A touch begins where the force exceeds this share of the largest force within the time around it.
+_TOUCH_FORCE_SHARE, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
+# Smallest time between two touches [s]; closer ones are bounces of one touch-down.
+_MIN_TOUCH_INTERVAL_S = 0.005
+# Largest time between two touches of a series [s]: 5 Hz.
+_MAX_TOUCH_INTERVAL_S = 0.2
+# Smallest number of touches, duration [s] and force [N] of a series.
+_MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
+# Largest time between a touch and the reversal of the command that explains it [s].
+_MAX_TIME_TO_REVERSAL_S = 0.1
 
 
-def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
+def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
     """Return indices of maxima and minima of x (N,); successive ones differ by > `swing`."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
@@ -37,8 +52,8 @@ def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp)
 
 
-def find_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_WINDOW_S
+def flag_unexplained_oscillation(
+    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
@@ -49,33 +64,33 @@ def find_unexplained_oscillation(
         t: (N,) times [s].
         command, actual: (N, k) commanded and actual motion in the unit of `swing`.
     """
-    commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
+    commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_explained_times(t[find_reversals(x, swing)], commanded, near)
+        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, near)
         for series in split_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
     return oscillating
 
 
-def find_unexplained_pose_oscillation(
+def flag_unexplained_pose_oscillation(
     t: Array, command: Array, actual: Array, near: float
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not."""
-    turned, wanted = (doubled_quaternions_near(pose, command) for pose in (actual, command))
-    swaying = find_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
-    return swaying | find_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
+    turned, wanted = (quaternions_as_angles(pose, command) for pose in (actual, command))
+    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
+    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
 
 
-def pose_reversals(t: Array, pose: Array) -> Array:
+def pose_reversal_times(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
-    rows = [find_reversals(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
-    rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in doubled_quaternions_near(pose, pose).T]
+    rows = [reversal_indices(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
+    rows += [reversal_indices(x, _MIN_AMPLITUDE_RAD) for x in quaternions_as_angles(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
-def doubled_quaternions_near(pose: Array, reference: Array) -> Array:
+def quaternions_as_angles(pose: Array, reference: Array) -> Array:
     """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
     Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).
@@ -98,7 +113,49 @@ def split_at_gaps(times: Array, longest: float) -> list[Array]:
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
 
-def high_pass(t: Array, signal: Array) -> Array:
+def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
     """Return the part of `signal` (N, k) above 5 Hz, for evenly spaced times `t` (N,) [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")
+
+
+class Chatter(NamedTuple):
+    """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
+
+    touches: int
+    rate_hz: float
+    peak_force: float
+    start: float
+    stop: float
+
+
+def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
+    """Return each long series of touches, without touches explained by reversals of the command.
+
+    A series has 8 or more touches, at most 0.2 s apart, and lasts 0.3 s or longer.
+
+    Args:
+        t: (N,) evenly spaced times [s].
+        force: (N,) magnitude of the contact force [N].
+        reversals: times of the command's reversals [s].
+    """
+    touches = remove_explained_times(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
+    found = []
+    for series in split_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
+        if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:
+            continue
+        start, stop = float(series[0]), float(series[-1])
+        peak = float(force[(t >= start) & (t <= stop)].max())
+        if peak >= _MIN_CHATTER_FORCE_N:
+            rate = (len(series) - 1) / (stop - start)
+            found.append(Chatter(len(series), rate, peak, start, stop))
+    return found
+
+
+def _find_touches(t: Array, force: Array) -> Array:
+    if len(t) < 2:
+        return np.empty(0)
+    rows = 2 * round(_PEAK_FORCE_WINDOW_S / (t[1] - t[0])) + 1
+    least = _TOUCH_FORCE_SHARE * maximum_filter1d(force, rows)[1:]
+    starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
+    return starts[np.diff(starts, prepend=-np.inf) >= _MIN_TOUCH_INTERVAL_S]

@@ -20,7 +20,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
-from drake_teleop.station.film import (
+from drake_teleop.station.master.data_sheets import PHANTOM_NAME
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.master.phantom import serial_joint_angles
+from drake_teleop.station.replay_file import (
     Canvas,
     DisplayedNumber,
     ForceArrow,
@@ -30,9 +33,6 @@ from drake_teleop.station.film import (
     frame_times,
     set_plain_background,
 )
-from drake_teleop.station.master.data_sheets import PHANTOM_NAME
-from drake_teleop.station.master.leader_model import Leader
-from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
@@ -52,14 +52,12 @@ _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
 _MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target without a haptic device
+_CAMERA_SHIFT_WITHOUT_DEVICE_W = np.array([-0.3, 0.0, 0.0])  # of camera and target
 
 
-_FLOOR_COLOUR, _WOOD_COLOUR, _STEEL_COLOUR = (
-    Rgba(0.93, 0.94, 0.95),
-    Rgba(0.78, 0.66, 0.50),
-    Rgba(0.40, 0.43, 0.47),
-)
+_FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
+_WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
+_STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
 _GRIP_P_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
 _WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
@@ -115,7 +113,7 @@ def write_replay(
             remedy="give the log of a station with a simulated slave",
         )
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
-    rows = _nearest_rows(result.t, times)
+    rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time
     # Read each signal of a log on disk once, and keep only the displayed rows.
     moving = [name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)]
     shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
@@ -130,31 +128,26 @@ def write_replay(
         readings=_displayed_numbers(signals),
         shaded=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm a newton, as large as at the slave.",),
-        curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
+        curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
         scene = ReplayScene(meshcat, scenario, signals)
-        return lambda film_time, frame: scene.show_sample(film_time, signals, frame)
+        return lambda replay_time, frame: scene.show_sample(replay_time, signals, frame)
 
     film.write(path, make_scene)
-
-
-def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
-    after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
-    after = np.minimum(after, len(t) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(times - t[before] <= t[after] - times, before, after)
 
 
 def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
     readings = [
-        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)
+        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, has_arrow=True)
     ]
     if "contact_wrench_S" in signals:
         contact = _row_norms(signals["contact_wrench_S"][:, :3])
-        readings.append(DisplayedNumber("Contact, calculated", "N", contact, VERMILION, arrow=True))
+        readings.append(
+            DisplayedNumber("Contact, calculated", "N", contact, VERMILION, has_arrow=True)
+        )
     if "force_to_master" in signals:
         readings.append(
             DisplayedNumber("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
@@ -249,13 +242,13 @@ class ReplayScene:
             elif shapes:
                 yield path, body
 
-    def show_sample(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Record row `sample` of the signals as the scene at `film_time` [s] of the replay."""
+    def show_sample(self, replay_time: float, signals: Mapping[str, Array], sample: int) -> None:
+        """Record row `sample` of the signals as the scene at `replay_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
             state = signals["master_state"][sample]
-            q = self._master.positions(state[: len(state) // 2])
+            q = self._master.to_plant_positions(state[: len(state) // 2])
             plant.SetPositions(context, self._master.instance, q)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
@@ -263,14 +256,14 @@ class ReplayScene:
             if name in signals:
                 self._set_body_pose(body, signals[name][sample])
         for path, body in self._bodies.items():
-            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
+            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), replay_time)
         if not self._arrows:
             return
         forces, places = self._contact_forces_W(signals, sample), self._arrow_positions_W()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
-            arrow.show_force(self.canvas, film_time, places[place], f_W)
+            arrow.show_force(self.canvas, replay_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
@@ -305,14 +298,14 @@ class ReplayScene:
 class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` is a function from logged joint positions to the plant's.
+    `to_plant_positions` is a function from logged joint positions to the plant's.
     """
 
     instance: ModelInstanceIndex
     hand: Frame
     grip: Array
-    positions: Callable[[Array], Array]
-    folder: object = None
+    to_plant_positions: Callable[[Array], Array]
+    model_folder: object = None
 
 
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
@@ -328,16 +321,10 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
 
 
 def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
-    order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
+    order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
     parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
-
-    def plant_positions(q: Array) -> Array:
-        ordered = np.empty(len(q))
-        ordered[order] = q
-        return ordered
-
     return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), plant_positions, parsed.folder
+        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.folder
     )
 
 
@@ -364,5 +351,5 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
                 f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
             )
     set_plain_background(meshcat)
-    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_W
+    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -13,18 +13,18 @@ from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale_of_scenario
-from drake_teleop.station.contact_chatter import find_chatter
+from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
-    MAX_HIGH_FREQUENCY_FORCE_N,
-    REVERSAL_WINDOW_S,
-    doubled_quaternions_near,
-    find_unexplained_oscillation,
-    find_unexplained_pose_oscillation,
-    high_pass,
-    pose_reversals,
+    MAX_FORCE_RIPPLE_N,
+    REVERSAL_DELAY_S,
+    find_chatter,
+    flag_unexplained_oscillation,
+    flag_unexplained_pose_oscillation,
+    high_pass_above_5_hz,
+    pose_reversal_times,
+    quaternions_as_angles,
 )
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -36,6 +36,7 @@ from drake_teleop.station.slave.posture_shapes import start_overlaps
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
+Warnings = Iterator[tuple[str, Spans]]
 
 _MIN_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
@@ -46,14 +47,14 @@ _SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
-_LEDGER_SETTLING_TIME_S = 0.05
+_LEDGER_SETTLING_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
 _MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
 _NUM_SETTLING_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
-_REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
+_MIN_REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
 _MIN_OSCILLATION_CYCLES = 4
 # Largest number of time spans that a warning lists; further ones are counted.
@@ -77,7 +78,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     overlaps, _ = start_overlaps(scenario.slave, scenario.surroundings)
     return [
         *overlaps,
-        *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans),
+        *(f"{condition} {_spans_text(spans)}" for condition, spans in found if spans),
     ]
 
 
@@ -106,7 +107,7 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
 
 
-def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_faults(result: SimulationResult) -> Warnings:
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -119,9 +120,7 @@ def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
             yield f"a fault: {meaning},", find_spans(t, happened)
 
 
-def _check_limits(
-    result: SimulationResult, scenario: Scenario, arm: ArmModel
-) -> Iterator[tuple[str, Spans]]:
+def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t = result.t
     flag = result["saturated"][:, 0]
     yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
@@ -130,7 +129,7 @@ def _check_limits(
             happened = result["ik_status"][:, 0] == status
             yield f"inverse kinematics: {status.name}", find_spans(t, happened)
     control = scenario.joint_control
-    asked, fastest = control.speed_gain * _joint_error(result), arm.velocity_limit
+    asked, fastest = control.speed_gain * _joint_tracking_error(result), arm.velocity_limit
     if control.position_interface is not None:
         fastest = np.minimum(fastest, control.position_interface.max_speed)
     for what, values, limit in (
@@ -147,30 +146,25 @@ def _check_limits(
             full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
-        yield (
-            "the device displays its largest force or torque",
-            find_spans(t, full, _MIN_SPAN_S),
-        )
+        spans = find_spans(t, full, _MIN_SPAN_S)
+        yield "the device displays its largest force or torque", spans
         ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
-    if scenario.leaf is not None and "sheet_state" in result:
-        bent = scenario.leaf.largest_small_deflection
+    if scenario.first_sheet_spring is not None and "sheet_state" in result:
+        bent = scenario.first_sheet_spring.largest_small_deflection
         yield (
             f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
             find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
         )
 
 
-def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     if "ports" not in result:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
-        silent = result[f"ports.{end}_silent"] > timeout
-        yield (
-            f"the {end}'s end is in its safe state, no packets arrive from the {other},",
-            find_spans(t, silent, _MIN_SPAN_S),
-        )
+        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_SPAN_S)
+        yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
@@ -178,39 +172,32 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     for command, actual, least, unit, scale in _position_and_rotation_parts(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
         spans = find_spans(t, lag > least, _MIN_SPAN_S)
-        largest = _maximum_within(t, lag, spans)
+        largest = _maximum_within_spans(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
             " more than its delay explains,",
             spans,
         )
     yield from _check_reserve_speed_limit(result, scenario)
-    oscillating = find_unexplained_pose_oscillation(t, sent, received, REVERSAL_WINDOW_S + window)
-    yield (
-        f"the channel ({by}) makes the slave's command oscillate",
-        find_spans(t, oscillating, _MIN_SPAN_S),
-    )
+    oscillating = flag_unexplained_pose_oscillation(t, sent, received, REVERSAL_DELAY_S + window)
+    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
-def _check_reserve_speed_limit(
-    result: SimulationResult, scenario: Scenario
-) -> Iterator[tuple[str, Spans]]:
+def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> Warnings:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale_of_scenario(
-        scenario
-    )
-    limit = speed_limit(config, mass)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
+    limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
     then = t - _newest_packet_ages_s(t, scenario)
-    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_TIME_S
-    for g, (command, actual, least, unit, scale) in enumerate(
-        _position_and_rotation_parts(sent, received)
-    ):
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_S
+    parts = _position_and_rotation_parts(sent, received)
+    for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_TIME_S)
+        far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
         speed = _running_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
@@ -233,13 +220,10 @@ def _check_reserve_speed_limit(
 def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    rotations = (
-        doubled_quaternions_near(command, command),
-        doubled_quaternions_near(actual, command),
-    )
+    wanted, turned = (quaternions_as_angles(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
-        (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
+        (wanted, turned, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     )
 
 
@@ -254,48 +238,40 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joint_tracking(
-    result: SimulationResult, scenario: Scenario, arm: ArmModel
-) -> Iterator[tuple[str, Spans]]:
+def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = (
-        _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
-        + 1 / scenario.rates.joint_control_hz
-    )
+    window = _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
         spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_SPAN_S)
-        largest = _maximum_within(t, far, spans)
+        largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
-    oscillating = find_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
-    yield (
-        "the slave oscillates while its command does not,",
-        find_spans(t, oscillating, _MIN_SPAN_S),
-    )
+    oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
+    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    yield "the slave oscillates while its command does not,", spans
 
 
-def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
-        oscillating = find_unexplained_pose_oscillation(
-            result.t, result["intent"], result["pose_master"], REVERSAL_WINDOW_S
+        oscillating = flag_unexplained_pose_oscillation(
+            result.t, result["intent"], result["pose_master"], REVERSAL_DELAY_S
         )
-        yield (
-            "the hand oscillates while its intent does not,",
-            find_spans(result.t, oscillating, _MIN_SPAN_S),
-        )
+        spans = find_spans(result.t, oscillating, _MIN_SPAN_S)
+        yield "the hand oscillates while its intent does not,", spans
 
 
-def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if "true_contact_wrench_W" not in result:
         return
     force = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
     command = next((result[name] for name in ("intent", "pose_command") if name in result), None)
-    reversals = np.empty(0) if command is None else pose_reversals(result.t, command)
+    reversals = np.empty(0) if command is None else pose_reversal_times(result.t, command)
     if found := find_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
@@ -307,17 +283,17 @@ def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Span
         )
 
 
-def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_rendered_force(result: SimulationResult) -> Warnings:
     if not {"ports", "intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
-    force = high_pass(t, result["force_to_master"][:, :3])
-    rows = round(_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
+    force = high_pass_above_5_hz(t, result["force_to_master"][:, :3])
+    rows = round(_MIN_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
     largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_HIGH_FREQUENCY_FORCE_N), _MIN_SPAN_S)
+    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_N), _MIN_SPAN_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
@@ -328,13 +304,13 @@ def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans
         return
     yield (
         f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
-        f" {_maximum_within(t, rms, spans):.2g} N rms while the hand rests (reduce"
+        f" {_maximum_within_spans(t, rms, spans):.2g} N rms while the hand rests (reduce"
         " force_scaling.gamma or force_scale, or increase passivity.ledger.initial with ledger),",
         spans,
     )
 
 
-def _joint_error(result: SimulationResult) -> Array:
+def _joint_tracking_error(result: SimulationResult) -> Array:
     if "joint_command" not in result:
         return np.zeros((len(result.t), 1))
     command = result["joint_command"]
@@ -359,11 +335,11 @@ def _running_maximum(x: Array, rows: int) -> Array:
     return largest
 
 
-def _maximum_within(t: Array, values: Array, spans: Spans) -> float:
+def _maximum_within_spans(t: Array, values: Array, spans: Spans) -> float:
     return max((float(values[(t >= a) & (t <= b)].max()) for a, b in spans), default=0.0)
 
 
-def _times_text(spans: Spans) -> str:
+def _spans_text(spans: Spans) -> str:
     listed = [
         f"from {start:.3f} to {stop:.3f} s" if stop > start else f"at {start:.3f} s"
         for start, stop in spans[:_MAX_LISTED_TIMES]

@@ -34,7 +34,7 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import Master, data_sheet_of
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import check_task
+from drake_teleop.station.operator.task import check_distance
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
@@ -132,7 +132,7 @@ class Scenario:
         return things[0] if len(things) == 1 else SeveralObjects(things)
 
     @property
-    def leaf(self) -> SheetSpring | None:
+    def first_sheet_spring(self) -> SheetSpring | None:
         """Sheet spring from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._touchables if isinstance(thing, SheetSpring)), None)
 
@@ -146,7 +146,7 @@ class Scenario:
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
-    def is_direct(self) -> bool:
+    def has_direct_channel(self) -> bool:
         """True if no network and no passivity method are between master and slave."""
         return (
             self.passivity.method == "none"
@@ -198,7 +198,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     Raises:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
-    data, where = ReadScenario(name_or_path)
+    data, where = ReadScenarioData(name_or_path)
     scenario = ScenarioFromData(data, where)
     folder = Path(where).parent
     scenario.slave = scenario.slave.with_absolute_paths(folder)
@@ -210,13 +210,13 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     return scenario
 
 
-def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
+def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
     """Read a scenario file; return the unchecked data, and the file's name for messages."""
-    path = shipped_file("scenario", name_or_path, scenarios_dir())
+    path = find_shipped_file("scenario", name_or_path, scenarios_dir())
     return read_yaml(path, tagged=True), str(path)
 
 
-def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
+def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
     A DrakeTeleopError about "no `kind`", such as "scenario", is raised if neither exists.
@@ -290,7 +290,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 def _check_task(scenario: Scenario, where: str) -> None:
     if scenario.operator.task is None:
         return
-    check_task(scenario.operator.task, f"{where}:operator.task")
+    check_distance(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
             "the scale is 0, but the operator's task requires motion of the slave (above 0)",
@@ -301,12 +301,8 @@ def _check_task(scenario: Scenario, where: str) -> None:
 
 def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
-    controlled = simulation.integrator == "runge_kutta3"
-    if (
-        scenario.surroundings is not None
-        and not controlled
-        and simulation.max_step > _MAX_CONTACT_STEP_S
-    ):
+    fixed = simulation.integrator != "runge_kutta3"
+    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_CONTACT_STEP_S:
         raise DrakeTeleopError(
             f"fixed steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
@@ -325,7 +321,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
     if scenario.master.is_joint_leader and not (
-        scenario.is_direct and scenario.contact_detection is None
+        scenario.has_direct_channel and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
             "a leader that commands joints requires a direct channel (a network transmits poses)",

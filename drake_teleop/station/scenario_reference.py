@@ -17,7 +17,7 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
+_MAX_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
 _YAML_FILE_HEAD = """\
 # Each field has its value, [the permitted values] and its meaning. Omitted fields have their
@@ -51,13 +51,13 @@ def to_commented_yaml(scenario: Scenario) -> str:
     return _YAML_FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
-def _find_texts(value: Any) -> list[str]:
+def _texts_in(value: Any) -> list[str]:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
         value = [*value, *value.values()]
     if isinstance(value, (list, tuple)):
-        return [word for each in value for word in _find_texts(each)]
+        return [word for each in value for word in _texts_in(each)]
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
@@ -66,18 +66,14 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
     A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
-    text, where = (
-        "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario),
-        str(path),
-    )
+    text = "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario)
+    where = str(path)
     found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
-    if found != scenario and _find_texts(found) != _find_texts(scenario):
+    if found != scenario and _texts_in(found) != _texts_in(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
-        lost = [
-            n for n in names if _find_texts(getattr(found, n)) != _find_texts(getattr(scenario, n))
-        ]
+        lost = [n for n in names if _texts_in(getattr(found, n)) != _texts_in(getattr(scenario, n))]
         raise DrakeTeleopError(
             f"YAML cannot represent the scenario's block {' and '.join(lost)}",
             where=where,
@@ -113,12 +109,10 @@ def _block_lines(config: Any) -> list[str]:
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {format_yaml(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
-    column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
-    preset = (
-        preset_of_block({"preset": config.preset})
-        if isinstance(config, WristSensorConfig)
-        else None
-    )
+    column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
+    preset = None
+    if isinstance(config, WristSensorConfig):
+        preset = preset_of_block({"preset": config.preset})
     lines = []
     for entry in entries:
         if entry.kind == "block":
@@ -135,17 +129,17 @@ def _inner_block_lines(entry: FieldInfo) -> list[str]:
         return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _comment_out_lines(_field_lines(entry, blocks))
-    return [line for block in blocks for line in _comment_out_lines(_field_lines(entry, block))]
+        return _prefix_lines("# ", _field_lines(entry, blocks))
+    return [line for block in blocks for line in _prefix_lines("# ", _field_lines(entry, block))]
 
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.lists:
         head = f"{entry.name}:{_tag_of_block(entry, value)}  # {entry.meaning}"
-        return [head, *_indent(_block_lines(value))]
+        return [head, *_prefix_lines("  ", _block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag_of_block(entry, item)}", *_indent(_indent(_block_lines(item)))]
+        lines += [f"  -{_tag_of_block(entry, item)}", *_prefix_lines(" " * 4, _block_lines(item))]
     return lines
 
 
@@ -153,12 +147,8 @@ def _tag_of_block(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
-def _indent(lines: list[str]) -> list[str]:
-    return [f"  {line}" for line in lines]
-
-
-def _comment_out_lines(lines: list[str]) -> list[str]:
-    return [f"# {line}" for line in lines]
+def _prefix_lines(prefix: str, lines: list[str]) -> list[str]:
+    return [prefix + line for line in lines]
 
 
 def _sections_of_page(config: Any, path: str) -> Iterator[str]:
@@ -173,7 +163,8 @@ def _sections_of_page(config: Any, path: str) -> Iterator[str]:
         for title, block in _titles_of_blocks(entry, path):
             yield f"\n## {title}\n"
             inner = entry.default if isinstance(entry.default, block) else block()
-            yield f"\n{_first_paragraph(inner)}\n"
+            first_paragraph, _, _ = (type(inner).__doc__ or "").partition("\n\n")
+            yield f"\n{' '.join(first_paragraph.split())}\n"
             yield from _sections_of_page(inner, f"{path}{entry.name}.")
 
 
@@ -196,10 +187,6 @@ def _links_to_blocks(entry: FieldInfo, path: str) -> str:
 
 def _anchor_of_title(title: str) -> str:
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-
-
-def _first_paragraph(config: Any) -> str:
-    return " ".join((type(config).__doc__ or "").partition("\n\n")[0].split())
 
 
 def _object_schema(config: Any) -> dict[str, Any]:

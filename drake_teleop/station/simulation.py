@@ -100,7 +100,7 @@ def _task_is_over(simulator: Simulator) -> bool:
 def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
-    for name, column in log_columns(station).items():
+    for name, column in log_slices_of_signals(station).items():
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
@@ -113,7 +113,7 @@ def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
     return int(log.num_samples())
 
 
-def log_columns(station: Diagram) -> dict[str, slice]:
+def log_slices_of_signals(station: Diagram) -> dict[str, slice]:
     """Return, by signal name, the slice of the signal's components in the station's log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
@@ -194,7 +194,7 @@ def read_recorded_signals(simulator: Simulator, start: float) -> SimulationResul
     t = log.sample_times() - start
     kept = t > -1e-9
     data = log.data().T[kept]
-    signals = {name: data[:, column] for name, column in log_columns(diagram).items()}
+    signals = {name: data[:, column] for name, column in log_slices_of_signals(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
     specs = [signal_of(name, values.shape[1]) for name, values in signals.items()]

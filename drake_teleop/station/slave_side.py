@@ -40,7 +40,7 @@ from drake_teleop.station.wiring import connect_ports, export_outputs
 Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
-MONITOR_PERIOD_S = 0.01
+SLAVE_MONITOR_PERIOD_S = 0.01
 # See `_check_friction_time_step`.
 _MAX_FRICTION_RATE_TIMES_STEP = 2.0
 
@@ -111,18 +111,12 @@ def MakeSlaveSide(
         builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
-    force_scaling = builder.AddNamedSystem(
-        "force_scaling",
-        ForceScaling(
-            scenario.force_scaling,
-            arm,
-            R_WB,
-            scenario.wrist_sensor.largest_wrench(),
-            max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz),
-        ),
-    )
+    largest = scenario.wrist_sensor.largest_plausible_wrench()
+    max_age_s = max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz)
+    scaling = ForceScaling(scenario.force_scaling, arm, R_WB, largest, max_age_s)
+    force_scaling = builder.AddNamedSystem("force_scaling", scaling)
     estimate = body.load_estimator.GetOutputPort("load_estimate")
-    builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
+    builder.Connect(body.sample_ports["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
     export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
@@ -133,7 +127,7 @@ def MakeSlaveSide(
     builder.Connect(state, kinematics.GetInputPort("slave_state"))
     export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
-        inputs = body.sample | {
+        inputs = body.sample_ports | {
             "slave_state": state,
             "pose_slave": kinematics.GetOutputPort("pose_slave"),
             "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
@@ -150,13 +144,10 @@ def MakeSlaveSide(
                 remedy="pass noise_floor=identify_load(...).noise_floor",
             )
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
-        detection = builder.AddNamedSystem(
-            "contact_detection",
-            ContactDetection(
-                scenario.contact_detection, noise_floor, arm, 1 / scenario.rates.estimator_hz
-            ),
-        )
-        builder.Connect(body.sample["sample"], detection.GetInputPort("sample"))
+        period = 1 / scenario.rates.estimator_hz
+        detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
+        builder.AddNamedSystem("contact_detection", detection)
+        builder.Connect(body.sample_ports["sample"], detection.GetInputPort("sample"))
         builder.Connect(estimate, detection.GetInputPort("load_estimate"))
         export_outputs(builder, detection, "contact")
     return builder.Build()
@@ -184,14 +175,11 @@ def _add_inverse_kinematics(
     arm = body.slave.arm
     make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
     make_ik = JointFollower if led else make_ik
-    ik = builder.AddNamedSystem(
-        "inverse_kinematics", make_ik(arm, body.slave.start, body.command_period)
-    )
+    ik = make_ik(arm, body.slave.start, body.command_period_s)
+    builder.AddNamedSystem("inverse_kinematics", ik)
     if not led:
-        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
-    builder.Connect(
-        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
-    )
+        builder.Connect(body.sample_ports["joint_position"], ik.GetInputPort("joint_position"))
+    connect_ports(builder, ik, "joint_command", body.joint_control, "joint_command")
     builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
     export_outputs(builder, ik, "joint_command")
     export_outputs(builder, body.monitor, "ik_status")
@@ -207,12 +195,9 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
     body = _add_slave_blocks(builder, scenario, q_start=start)
-    command = builder.AddNamedSystem(
-        "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
-    )
-    builder.Connect(
-        command.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
-    )
+    command = JointTrajectory(trajectory, scenario.simulation.settle)
+    builder.AddNamedSystem("joint_trajectory", command)
+    connect_ports(builder, command, "joint_command", body.joint_control, "joint_command")
     export_outputs(builder, command, "joint_command")
     return builder.Build()
 
@@ -223,8 +208,8 @@ class _SlaveBlocks:
     joint_control: LeafSystem
     monitor: LeafSystem
     load_estimator: LeafSystem
-    sample: dict[str, OutputPort]
-    command_period: float  # period of joint commands [s]
+    sample_ports: dict[str, OutputPort]
+    command_period_s: float
 
 
 def _add_slave_blocks(
@@ -259,18 +244,12 @@ def _add_slave_blocks(
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD_S))
+    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, SLAVE_MONITOR_PERIOD_S))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
+    motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
     sample = AddCompiledWristSensor(
-        builder,
-        slave,
-        sensor,
-        scenario.motion_estimation,
-        1 / rates.sensor_hz,
-        held,
-        start,
-        ramps=ramps,
+        builder, slave, sensor, motion, sensor_period, held, start, ramps=ramps
     )
     wrist = builder.GetSubsystemByName("wrist_sensor")
     acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
@@ -286,21 +265,17 @@ def _add_slave_blocks(
     for name, port in sample.items():
         builder.ExportOutput(port, name)
 
-    estimator = builder.AddNamedSystem(
-        "load_estimator",
-        LoadEstimator(
-            scenario.load_estimator,
-            sensor.wrench_std(),
-            estimated_motion_std(
-                scenario.motion_estimation, sensor, arm.num_joints, 1 / rates.sensor_hz
-            ),
-            1 / rates.estimator_hz,
-            sample["sample"].size(),
-            np.zeros(16) if load_estimate is None else load_estimate,
-            load_covariance,
-            scenario.force_scaling.gripper_phi,
-        ),
+    estimator = LoadEstimator(
+        scenario.load_estimator,
+        sensor.wrench_std(),
+        estimated_motion_std(motion, sensor, arm.num_joints, sensor_period),
+        1 / rates.estimator_hz,
+        sample["sample"].size(),
+        np.zeros(16) if load_estimate is None else load_estimate,
+        load_covariance,
+        scenario.force_scaling.gripper_phi,
     )
+    builder.AddNamedSystem("load_estimator", estimator)
     # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))

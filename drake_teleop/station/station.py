@@ -16,7 +16,7 @@ from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave_side import MakeSlaveOnTrajectory, MakeSlaveSide
-from drake_teleop.station.wiring import connect_ports, record_signals
+from drake_teleop.station.wiring import build_with_log, connect_ports
 
 
 def MakeTeleopStation(
@@ -68,7 +68,7 @@ def MakeTeleopStation(
     master = builder.AddNamedSystem("master_side", master or MakeMasterSide(scenario))
 
     sides = [master, slave]
-    if channel is None and scenario.is_direct and scenario.contact_detection is None:
+    if channel is None and scenario.has_direct_channel and scenario.contact_detection is None:
         # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
         connect_ports(builder, master, setpoint, slave, setpoint)
@@ -97,7 +97,7 @@ def MakeTeleopStation(
     for name in ("clutch", "intended_pose", "intended_twist"):
         if master.HasInputPort(name):
             builder.ExportInput(master.GetInputPort(name), name)
-    return record_signals(builder, "teleop_station", sides, scenario.rates.log_hz)
+    return build_with_log(builder, "teleop_station", sides, scenario.rates.log_hz)
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -106,7 +106,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     expect_type(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
-    return record_signals(builder, "identification_station", (slave,), scenario.rates.log_hz)
+    return build_with_log(builder, "identification_station", (slave,), scenario.rates.log_hz)
 
 
 def GetBlock(station: Diagram, name: str) -> System:

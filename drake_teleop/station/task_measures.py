@@ -19,7 +19,7 @@ from drake_teleop.station.operator.decision import (
     PHASE_STOPPING,
     PHASE_WAITING,
 )
-from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Task, Touch
+from drake_teleop.station.operator.task import TASK_MEASURE_NAMES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -54,11 +54,9 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     span = slice(begun, ended + 1)
     done = state[ended, OUTCOME_INDEX] > 0.0
     force = contact_force(result)
-    held = (
-        _forces_during_hold(t, force, task, ended)
-        if done and isinstance(task, Press)
-        else np.empty(0)
-    )
+    held = np.empty(0)
+    if done and isinstance(task, Press):
+        held = _forces_during_hold(t, force, task, ended)
     wanted = _required_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
@@ -77,10 +75,10 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         measures_of_success = dict.fromkeys(measures_of_success, math.nan)
     figures = measures_of_success | {
         "success": float(success),
-        "detection_time_s": detection_time(t[span], touching, noticed),
+        "detection_time_s": detection_delay(t[span], touching, noticed),
         "false_notices": float(_count_false_detections(touching, noticed)),
     }
-    return {name: figures[name] for name in TASK_MEASURES}
+    return {name: figures[name] for name in TASK_MEASURE_NAMES}
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
@@ -130,7 +128,7 @@ def contact_force(result: SimulationResult) -> Array:
     return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
 
 
-def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
+def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
     """Return the time from the first contact to its detection [s]; nan if either is missing."""
     if not touching.any():
         return math.nan
@@ -160,11 +158,8 @@ def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, 
     off = _tip_from_target(result, scenario, task, ended)
     if isinstance(task, Insert):
         above = off[2] + task.depth
-        return (
-            ""
-            if above <= _FLOOR_TOLERANCE_M
-            else f"the tip is {1e3 * above:.1f} mm above the floor"
-        )
+        wrong = f"the tip is {1e3 * above:.1f} mm above the floor"
+        return "" if above <= _FLOOR_TOLERANCE_M else wrong
     away = float(np.linalg.norm(off))
     if isinstance(task, Touch):
         return f"the tool touches nothing, the tip {1e3 * away:.1f} mm from the target"

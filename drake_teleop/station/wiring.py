@@ -35,8 +35,8 @@ def connect_ports(
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
-    _check_port_size(output, source, f"output port '{name}'")
-    _check_port_size(port, target, f"input port '{entry}'")
+    _check_port_exists(output, source, f"output port '{name}'")
+    _check_port_exists(port, target, f"input port '{entry}'")
     if output.size() != port.size():
         raise DrakeTeleopError(
             f"its output port '{name}' has {output.size()} numbers, but input port '{entry}' of "
@@ -47,7 +47,7 @@ def connect_ports(
     builder.Connect(output, port)
 
 
-def record_signals(
+def build_with_log(
     builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
 ) -> Diagram:
     """Export and record the sides' signals at `log_hz`; build the diagram."""
@@ -75,7 +75,7 @@ def record_signals(
     return diagram
 
 
-def _check_port_size(port: Any, side: System, what: str) -> None:
+def _check_port_exists(port: Any, side: System, what: str) -> None:
     if not port:
         raise DrakeTeleopError(
             f"the block has no {what}",

@@ -14,7 +14,7 @@ from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.channel_side import MakeChannel, _adapt_to_device
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.memory import HELD_WRENCH, LOAD_WRENCH
+from drake_teleop.station.passivity.memory import LAST_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
@@ -132,7 +132,7 @@ def test_load_wrench_is_transformed_as_the_wrench():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[SLAVE_METHOD_MEMORY][HELD_WRENCH]
+    held = ends[SLAVE_METHOD_MEMORY][LAST_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
     np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 

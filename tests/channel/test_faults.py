@@ -14,12 +14,12 @@ from drake_teleop.station.channel.channel import (
     step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD_WRENCH, SERVO_D, SERVO_K
+from drake_teleop.station.passivity.memory import LAST_WRENCH, SERVO_D, SERVO_K
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
     method_parameters,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
@@ -86,13 +86,13 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         if now and fault == "saturated":
             inputs["slave_wrench"][:] = 1e3
         step_channel(
-            steps_of(method), *inputs.values(), now and fault == "saturated",
+            step_addresses(method), *inputs.values(), now and fault == "saturated",
             float(wall < 0.0), T, TIMEOUT, frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[SERVO_K][0] * (received[4] - slave[4]) - p[SERVO_D][0] * velocity
-        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][HELD_WRENCH][0]
+        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][LAST_WRENCH][0]
     return found
 
 

@@ -24,7 +24,6 @@ from drake_teleop.station.channel.network import (
     initial_network_state,
     network_parameters,
     newest_packets,
-    packet_delays,
     receive_packet,
     send_packet,
 )
@@ -44,6 +43,10 @@ STEPS = 700
 ROUGH = NetworkConfig(
     delay=0.04, jitter=1.0, distribution="gamma", loss=0.3, burst=0.02, duplicate=0.2
 )
+
+
+def packet_delays(config, seed, direction, steps, period):
+    return network.packet_delays(network_parameters(config, seed, direction, period), steps)
 
 
 def share(high: float = 1.0) -> st.SearchStrategy[float]:
@@ -294,7 +297,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
     monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
     for k in range(100, 120):
-        network._advance_loss_chain.py_func(p, k, 0.0)
+        network._draw_loss_and_delays.py_func(p, k, 0.0)
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]

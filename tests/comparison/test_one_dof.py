@@ -267,8 +267,8 @@ def test_changing_hand_wall_and_imperfections():
     noise = run.felt[50:590] / model.force_scale
     assert noise.std() == pytest.approx(0.5, rel=0.15)
     assert run.master[749] < 0.019 and np.all(run.silent[-1] > 0.09)
-    steps_of = np.round(run.command[600:800] / 30e-6) * 30e-6
-    np.testing.assert_allclose(run.command[600:800], steps_of, atol=1e-15)
+    step_addresses = np.round(run.command[600:800] / 30e-6) * 30e-6
+    np.testing.assert_allclose(run.command[600:800], step_addresses, atol=1e-15)
 
 
 def test_adversary_is_reproducible_and_finds_leaks_and_cycles(

@@ -40,20 +40,20 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
-    motion_estimator,
+    initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -185,12 +185,12 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     vectors = np.empty((3, len(t), 3))
     write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
-    constants, memory = sensor_chain_constants(sensor, 6, period)
-    estimator, remembered = motion_estimator(motion, sensor, 6, period)
+    constants, memory = initialize_sensor_chain(sensor, 6, period)
+    estimator, remembered = initialize_motion_estimator(motion, sensor, 6, period)
     samples, found = np.empty((len(t), 22)), []
     rng = np.random.default_rng(0)
     for _ in range(200):
-        noise = rng.standard_normal((len(t) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(t) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         wrench, s, omega, alpha = (samples[::2, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
@@ -698,12 +698,12 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     sensor = dataclasses.replace(
         without_parts(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
     )
-    constants, memory = sensor_chain_constants(sensor, joints, 1e-3)
+    constants, memory = initialize_sensor_chain(sensor, joints, 1e-3)
     rng = np.random.default_rng(0)
     readings = np.empty((len(recording.t), 13 + joints))
     for k, truth in enumerate(recording.truth):
         if k % SAMPLES_PER_NOISE_BLOCK == 0:
-            noise = rng.standard_normal(NOISE_SIZE)
+            noise = rng.standard_normal(NOISE_BLOCK_SIZE)
         read_sensor_into(constants, memory, noise, truth, readings[k])
     log = write_log(tmp_path, recording.t, readings, recording)
     with pytest.raises(SystemExit) as stop:

@@ -29,7 +29,7 @@ from drake_teleop.lab.excitation.optimizer import Problem, Task, _DescentSearch
 from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
-from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_filters
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_gains
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -107,10 +107,10 @@ def test_predicted_deviations_are_those_of_white_noise():
 def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
-    for filter_ in fusion_filters(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _error_filter(filter_, T)
+    for gains in fusion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
+        numerator, denominator = _error_filter(gains, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
-        correct = np.eye(3) - np.outer(filter_.gains, [1.0, 0.0, 0.0])
+        correct = np.eye(3) - np.outer(gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
         found = np.sort_complex(np.roots(denominator).astype(complex))
         np.testing.assert_allclose(found, poles, rtol=0.015)

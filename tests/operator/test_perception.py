@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.operator.perception import (
     CONTACT_NOTICED_INDEX,
+    DETECTION_THRESHOLD_INDEX,
     EXCESS_FORCE_START,
-    THRESHOLD_INDEX,
     Perception,
     perceive_contact,
 )
@@ -64,8 +64,8 @@ def test_inertial_force_masks_a_contact(push):
 def test_moved_mass_is_learned_and_is_no_contact():
     felt = perceive_contact(T, *record(1.2, 2.0, 0.0, 0.1), HUMAN, 0.0, attentive=3.0)
     late = T > 3.0
-    assert np.abs(felt[late, EXCESS_FORCE_START:THRESHOLD_INDEX]).max() < 0.1
-    assert felt[late, THRESHOLD_INDEX].min() > 0.4
+    assert np.abs(felt[late, EXCESS_FORCE_START:DETECTION_THRESHOLD_INDEX]).max() < 0.1
+    assert felt[late, DETECTION_THRESHOLD_INDEX].min() > 0.4
     assert not felt[:, CONTACT_NOTICED_INDEX].any()
 
 
@@ -79,7 +79,7 @@ def test_masking_fades_with_its_time_constant():
     moving = (T < 4.0)[:, np.newaxis]
     felt = perceive_contact(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)
     a, b = np.searchsorted(T, [4.2, 4.5])
-    ratio = felt[b, THRESHOLD_INDEX] / felt[a, THRESHOLD_INDEX]
+    ratio = felt[b, DETECTION_THRESHOLD_INDEX] / felt[a, DETECTION_THRESHOLD_INDEX]
     assert ratio == pytest.approx(np.exp(-0.3 / HUMAN.masking_time), rel=0.02)
 
 

@@ -20,17 +20,17 @@ from drake_teleop.station.operator.decision import (
     PHASE_SEARCHING_SLOT,
     PHASE_STOPPING,
 )
-from drake_teleop.station.operator.minimum_jerk import add_plan_into, plan_move
+from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into, plan_move
 from drake_teleop.station.operator.perception import (
     CONTACT_NOTICED_INDEX,
     Perception,
     perceive_contact,
 )
-from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_task
+from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_distance
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import contact_force, detection_time, task_measures
+from drake_teleop.station.task_measures import contact_force, detection_delay, task_measures
 
 #: Rates of a study: the operator notices no difference.
 FAST = {
@@ -199,7 +199,7 @@ def test_rendered_weight_raises_threshold_and_slows_approach(touch):
     without, with_load = touch[0.0][1], touch[1.0][1]
     assert with_load["task_time_s"] > without["task_time_s"]
     assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
-    limit = [result["task_state"][-1, decision.FORCE_LIMIT_INDEX] for result, _ in touch.values()]
+    limit = [run["task_state"][-1, decision.FORCE_THRESHOLD_INDEX] for run, _ in touch.values()]
     assert limit[0] == pytest.approx(0.06, abs=0.005)
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
@@ -262,7 +262,7 @@ def test_papers_contact_is_detected_without_false_detection():
     )
     touching = contact_force(result) > 0.0
     assert not noticed[: np.argmax(touching)].any()
-    assert detection_time(result.t, touching, noticed) < 0.03
+    assert detection_delay(result.t, touching, noticed) < 0.03
 
 
 def test_movements_are_continuous_to_acceleration():
@@ -271,7 +271,7 @@ def test_movements_are_continuous_to_acceleration():
 
     def wanted(at):
         pose, twist = np.zeros(7), np.zeros(6)
-        add_plan_into(memory, at, pose, twist)
+        add_planned_motion_into(memory, at, pose, twist)
         return pose[4:], twist[:3]
 
     for _ in range(5):
@@ -321,9 +321,9 @@ def test_impossible_task_is_rejected(changes, message):
 
 
 def test_target_beyond_its_radius_is_accepted():
-    check_task(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
+    check_distance(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
     with pytest.raises(DrakeTeleopError, match=r"not above 0\.02 m"):
-        check_task(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
+        check_distance(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 
 def test_measures_need_a_task(reach):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.html import content_security_policy, render_page
-from drake_teleop.station.film import ReplayFile
+from drake_teleop.station.replay_file import ReplayFile
 
 CODE = "const a = 1;\nlet b = 'é';"
 

@@ -12,7 +12,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE, move_pose_into, pose_difference_into
 
@@ -37,7 +37,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     move_pose_into(START, moved, pose)  # the hand's; the slave is at the start
 
     slave_step(
-        steps_of("four_channel"),
+        step_addresses("four_channel"),
         np.zeros(PACKET_SIZE),
         False,
         START,
@@ -51,7 +51,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         packets[1],
     )
     master_step(
-        steps_of("four_channel"),
+        step_addresses("four_channel"),
         packets[1],
         True,
         pose,
@@ -72,8 +72,8 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     np.testing.assert_allclose(wrench, expected, rtol=1e-12)
 
     slave_step(
-        steps_of("four_channel"), packets[0], True, START, twist[1], zero, contact, T, p, memory[1],
-        command, packets[1],
+        step_addresses("four_channel"), packets[0], True, START, twist[1], zero, contact, T, p,
+        memory[1], command, packets[1],
     )  # fmt: skip
     K, D = (np.repeat(p[x], 3) for x in (SERVO_K, SERVO_D))
     shift = np.empty(6)

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.ledger_slave import _BALANCE
+from drake_teleop.station.passivity.ledger_slave import _MOTOR_ENERGY
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     RECEIVED_ENERGY,
@@ -38,7 +38,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
@@ -130,7 +130,7 @@ def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
 
 def test_ledger_is_input_minus_output_and_keeps_its_deficit():
     """At every step of both ends, also with a hand that is only pushed."""
-    p, method = method_parameters(CHARGED_BY_DRAG), steps_of("ledger")
+    p, method = method_parameters(CHARGED_BY_DRAG), step_addresses("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     ends = [initial_method_memory("ledger", p, start) for _ in range(2)]
     packets, still = [np.zeros(PACKET_SIZE) for _ in range(2)], np.zeros(6)
@@ -173,11 +173,11 @@ def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
     twist = np.array([0.06, 0.08, 0.0, 0.0, 0.0, 0.5])
     held = memory[STORED_ENERGY].copy()
     slave_step(
-        steps_of("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
+        step_addresses("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
         PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
     )  # fmt: skip
     moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])
-    np.testing.assert_allclose(memory[_BALANCE], held - moving, rtol=1e-12)
+    np.testing.assert_allclose(memory[_MOTOR_ENERGY], held - moving, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [4, 38])

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.passivity.ledger import (
-    _FRICTION_AT_HAND,
-    _FRICTION_AT_SLAVE,
-    _FRICTION_REST,
+    _FRICTION_RESIDUAL,
+    _MODEL_FRICTION_AT_HAND,
+    _MODEL_FRICTION_AT_SLAVE,
     LedgerConfig,
 )
 from drake_teleop.station.passivity.ledger_slave import (
     _CONTACT_DAMPING,
     _CONTACT_STIFFNESS,
     _DISPLAYED_FORCE,
-    _LAST_SPEED,
+    _LAST_INWARD_SPEED,
+    CONTACT_DIRECTION,
     CONTACT_STIFFNESS,
     IN_CONTACT,
     LEDGER_LEVEL,
-    NORMAL,
     OWN_VELOCITY,
     ROUND_TRIP,
     _is_wall_removed,
@@ -44,7 +44,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
     MAX_WRENCH_RATE,
@@ -82,7 +82,7 @@ class Hand:
         self.packet[PACKET_NUMBER] += 1.0
         sent, still = np.zeros(PACKET_SIZE), np.zeros(6)
         master_step(
-            steps_of("ledger"), self.packet, True, self.pose, dx / T, dx, still,
+            step_addresses("ledger"), self.packet, True, self.pose, dx / T, dx, still,
             self.p[WRENCH_LIMIT], T, self.p, self.memory, self.felt, sent,
         )  # fmt: skip
         return self.felt.copy()
@@ -223,8 +223,8 @@ def test_friction_stays_across_the_direction_as_it_turns():
     for _ in range(200):
         hand.packet[POSE][4:] += 1e-6 * rng.normal(size=3)
         felt = hand.step(rng.normal(size=6) * np.repeat([1e-6, 1e-5], 3))
-        normal = hand.memory[NORMAL]
-        for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
+        normal = hand.memory[CONTACT_DIRECTION]
+        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _FRICTION_RESIDUAL):
             assert abs(wrench_component_along(hand.memory[friction], normal, hand.p)) < 1e-12
         pressed = wrench_component_along(hand.packet[WRENCH], normal, hand.p)
         assert wrench_component_along(felt, normal, hand.p) == pytest.approx(pressed, abs=1e-9)
@@ -376,8 +376,8 @@ def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
 ):
     memory = initial_method_memory("ledger", method_parameters(RICH), START)
     normal = np.array([0.6, 0.0, -0.8, 0.0, 0.0, 0.0])
-    memory[NORMAL], memory[OWN_VELOCITY] = normal, -speeds[0] * normal
-    memory[_LAST_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
+    memory[CONTACT_DIRECTION], memory[OWN_VELOCITY] = normal, -speeds[0] * normal
+    memory[_LAST_INWARD_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
     memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = stiffness, damping
     explained = stiffness * abs(step) + damping * abs(speeds[1] - speeds[0])
     removed = _is_wall_removed(step * normal, memory)
@@ -401,8 +401,8 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
         received[POSE][6] -= 0.005
         received[PACKET_NUMBER] += 1.0
         slave_step(
-            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
-            packet,
+            step_addresses("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory,
+            command, packet,
         )  # fmt: skip
         before[:] = pose
     assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
@@ -426,8 +426,8 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
         wrench = np.array([rubs, 0.0, force, 0.0, 0.1 * rubs, 0.0])
         received[PACKET_NUMBER] += 1.0
         slave_step(
-            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
-            packet,
+            step_addresses("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory,
+            command, packet,
         )  # fmt: skip
         hand.packet[WRENCH], hand.packet[ROUND_TRIP] = packet[WRENCH], packet[ROUND_TRIP]
         felt.append(hand.step()[2])
@@ -450,7 +450,7 @@ def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
         memory[IN_CONTACT] = 1.0
         turned = wrench * np.repeat([-1.0, 0.5], 3)
         assert update_contact_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
-        assert wrench_component_along(memory[NORMAL], wrench, p) < 0.0
+        assert wrench_component_along(memory[CONTACT_DIRECTION], wrench, p) < 0.0
     np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
 
 
@@ -472,13 +472,15 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
         wrench = contact + memory[LOAD_WRENCH]
         received[PACKET_NUMBER] += 1.0
         slave_step(
-            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
-            packet,
+            step_addresses("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory,
+            command, packet,
         )  # fmt: skip
         np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
         np.testing.assert_allclose(packet[PACKET_LOAD_WRENCH], load, atol=0.15)
         assert k > 400 or not memory[IN_CONTACT], "nothing is touched yet"
-    np.testing.assert_allclose(memory[NORMAL], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        memory[CONTACT_DIRECTION], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12
+    )
     stiffness = packet[CONTACT_STIFFNESS]
     assert stiffness == pytest.approx(200.0, rel=0.05)
     # The packets take what is passed on to the hand, which has nothing here.

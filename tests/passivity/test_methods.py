@@ -19,7 +19,7 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
-    HELD_WRENCH,
+    LAST_WRENCH,
     MEMORY_SIZE,
     MOTION_SCALE,
     SENT_ENERGY,
@@ -36,7 +36,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
@@ -86,7 +86,7 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
     sent = np.zeros((2, steps, PACKET_SIZE))
     wrench, command, dx = np.zeros((steps, 6)), np.zeros((steps, 13)), np.zeros((2, steps, 6))
     nothing = np.zeros(PACKET_SIZE)
-    m = steps_of(method)
+    m = step_addresses(method)
     for k in range(steps):
         for end, pose in enumerate((master_poses, slave_poses)):
             pose_difference_into(pose[k], pose[max(k - 1, 0)], dx[end, k])
@@ -174,7 +174,7 @@ def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
     memory = initial_method_memory(method, p, START)
     received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
     wrench, command, packet = np.ones(6), np.zeros(13), np.zeros(PACKET_SIZE)
-    m = steps_of(method)
+    m = step_addresses(method)
     master_step(
         m, received, False, START, zero, zero, zero, p[WRENCH_LIMIT], T, p, memory, wrench, packet
     )
@@ -194,7 +194,7 @@ def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
 @pytest.mark.parametrize("method", METHODS)
 def test_step_writes_only_into_its_arguments(method):
     """Compiled code does not check bounds: each array lies between other numbers here."""
-    rng, m = np.random.default_rng(4), steps_of(method)
+    rng, m = np.random.default_rng(4), step_addresses(method)
     around = []
 
     def guarded(values):
@@ -308,12 +308,12 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
         np.zeros(6),
     )
     received = packet.copy()
-    received[WRENCH][1] = memory[HELD_WRENCH][1] = 3.0
+    received[WRENCH][1] = memory[LAST_WRENCH][1] = 3.0
     memory[STORED_ENERGY][0] = stored
     dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
     master_step(
-        steps_of("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[WRENCH_LIMIT], T, p,
-        memory, wrench, packet,
+        step_addresses("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[WRENCH_LIMIT], T,
+        p, memory, wrench, packet,
     )  # fmt: skip
     np.testing.assert_allclose(wrench, [0.0, left, 0.0, 0.0, 0.0, 0.0], rtol=1e-12, atol=0.0)
 

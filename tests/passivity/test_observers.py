@@ -19,9 +19,9 @@ from drake_teleop.station.passivity.methods import (
     initial_method_memory,
     master_step,
     method_parameters,
-    steps_of,
+    step_addresses,
 )
-from drake_teleop.station.passivity.packet import PACKET_SIZE, POSE, SECOND_ENERGY
+from drake_teleop.station.passivity.packet import PACKET_SIZE, POSE, SECOND_ENERGY_COUNTER
 
 
 def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
@@ -70,10 +70,10 @@ def test_drag_acts_only_below_the_reserve(short):
     memory = initial_method_memory("charged_tdpa", p, poses(np.random.default_rng(0), 1)[0])
     received, packet = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE)
     received[POSE] = [1, 0, 0, 0, 0, 0, 0]
-    received[SECOND_ENERGY] = 0.0 if short == "slave" else 1.0
+    received[SECOND_ENERGY_COUNTER] = 0.0 if short == "slave" else 1.0
     memory[STORED_ENERGY] = 0.0 if short == "master" else 1.0
     master_step(
-        steps_of("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
+        step_addresses("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
         p[WRENCH_LIMIT], T, p, memory, wrench, packet,
     )  # fmt: skip
     if short is None:

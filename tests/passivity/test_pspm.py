@@ -9,7 +9,7 @@ from drake_teleop.station.passivity import pspm
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
@@ -21,7 +21,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
     PACKET_SIZE,
@@ -58,7 +58,7 @@ def test_stored_energy_is_what_was_put_in(end):
         servo_damping=[2.0, 0.02],
         retreat=[1e3, 1e3],  # else the wrench does not tell the spring
     )
-    p, m = method_parameters(config), steps_of("pspm")
+    p, m = method_parameters(config), step_addresses("pspm")
     memory = initial_method_memory("pspm", p, START)
     first, work = memory[STORED_ENERGY].copy(), np.zeros(2)
     other = initial_method_memory("pspm", p, START)
@@ -115,7 +115,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
     """The damper acts beyond the limit; a withheld wrench costs no energy."""
     p, m, rng = (
         method_parameters(PassivityConfig(method="pspm")),
-        steps_of("pspm"),
+        step_addresses("pspm"),
         np.random.default_rng(2),
     )
     memory, packet, wrench = (
@@ -153,7 +153,7 @@ def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     move_pose_into(pose, asked, wanted)
     move_pose_into(pose, left, command)
     pspm.record_command.py_func(wanted, command, pose, twist, p, memory)
-    np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
+    np.testing.assert_allclose(memory[LAST_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))
     np.testing.assert_allclose(memory[STORED_ENERGY], before - more, rtol=1e-9)

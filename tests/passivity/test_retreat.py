@@ -7,9 +7,9 @@ import pytest
 
 from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY_SIZE
+from drake_teleop.station.passivity.memory import LAST_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
-from drake_teleop.station.passivity.safe_state import limit_retreat_of_hand
+from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
 
 LET_GO = 9000
 
@@ -39,10 +39,10 @@ def test_only_wrench_along_a_fast_hand_fades():
 
     def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
         memory, wrench = np.zeros(MEMORY_SIZE), given.copy()
-        limit_retreat_of_hand(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
+        fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
         wrench[:] = given
-        limit_retreat_of_hand(now, 1e-9, p, memory, wrench)
-        np.testing.assert_array_equal(memory[HELD_WRENCH], wrench)
+        fade_retreat_wrench(now, 1e-9, p, memory, wrench)
+        np.testing.assert_array_equal(memory[LAST_WRENCH], wrench)
         return np.array([wrench[:3] @ along[:3], wrench[3:] @ along[3:]])
 
     for speed, share in ((-9.0, 1.0), (0.99, 1.0), (1.5, 0.5), (2.0, 0.0), (9.0, 0.0)):
@@ -55,7 +55,5 @@ def test_only_wrench_along_a_fast_hand_fades():
 
 def test_wrench_is_unchanged_without_a_method():
     memory, wrench = np.zeros(MEMORY_SIZE), np.ones(6)
-    limit_retreat_of_hand(
-        np.full(6, 50.0), 1.0, method_parameters(PassivityConfig()), memory, wrench
-    )
+    fade_retreat_wrench(np.full(6, 50.0), 1.0, method_parameters(PassivityConfig()), memory, wrench)
     np.testing.assert_array_equal(wrench, np.ones(6))

@@ -25,7 +25,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
@@ -186,7 +186,7 @@ def test_packet_does_not_contain_old_memory(method):
     """The sent packet is finite for any previous content of its memory."""
     p = method_parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-    number, still = steps_of(method), np.zeros(6)
+    number, still = step_addresses(method), np.zeros(6)
     for step, limits, out in (
         (master_step, [p[WRENCH_LIMIT]], np.zeros(6)),
         (slave_step, [], np.zeros(13)),

@@ -17,7 +17,7 @@ from drake_teleop.station.passivity.methods import (
     master_step,
     method_parameters,
     slave_step,
-    steps_of,
+    step_addresses,
 )
 from drake_teleop.station.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
 from drake_teleop.station.passivity.wave import WaveConfig
@@ -47,16 +47,16 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
         if k not in missing:
             at_hand = sent[1, k - backward] if k >= backward else nothing
         master_step(
-            steps_of("wave"), at_hand, k not in missing, pose, dx / T, dx, zero, p[WRENCH_LIMIT],
-            T, p, memory[0], wrench[k], sent[0, k],
+            step_addresses("wave"), at_hand, k not in missing, pose, dx / T, dx, zero,
+            p[WRENCH_LIMIT], T, p, memory[0], wrench[k], sent[0, k],
         )  # fmt: skip
         u[k] = (sent[0, k, INTEGRAL][0] - (sent[0, k - 1, INTEGRAL][0] if k else 0.0)) / T
         received = sent[0, k - forward] if k >= forward else nothing
         f_e = zero.copy()
         f_e[0] = contact(u[k - forward] if k >= forward else 0.0, command[k - 1, 4])
         slave_step(
-            steps_of("wave"), received, True, start, zero, zero, f_e, T, p, memory[1], command[k],
-            sent[1, k],
+            step_addresses("wave"), received, True, start, zero, zero, f_e, T, p, memory[1],
+            command[k], sent[1, k],
         )  # fmt: skip
     return wrench[:, 0], command[:, 4]
 
@@ -144,7 +144,8 @@ def test_energy_that_fills_a_line_counts_once():
     for k in range(n):
         received[ENERGY] = 0.01 * k
         slave_step(
-            steps_of("wave"), received, True, start, zero, zero, f_e, T, p, memory, command, packet
+            step_addresses("wave"), received, True, start, zero, zero, f_e, T, p, memory, command,
+            packet,
         )  # fmt: skip
     power = force**2 / (4.0 * config.impedance[0])
     np.testing.assert_allclose(packet[ENERGY], [n * T * power, 0.0], rtol=1e-9)
@@ -179,13 +180,13 @@ def test_drift_fades_unless_that_increases_contact_force(touch, rest):
     aside = np.array([0.01, -0.02, 0.03])
     for _ in range(200):
         master_step(
-            steps_of("wave"), nothing, True, start, zero, zero, zero, p[WRENCH_LIMIT], T, p,
+            step_addresses("wave"), nothing, True, start, zero, zero, zero, p[WRENCH_LIMIT], T, p,
             memory[0], zero.copy(), sent,
         )  # fmt: skip
         sent[POSE][4:] = aside
         f_e = np.array([*(-touch * aside), 0.0, 0.0, 0.0])
         slave_step(
-            steps_of("wave"),
+            step_addresses("wave"),
             sent,
             True,
             start,

@@ -22,19 +22,19 @@ from drake_teleop.station.sensor.motion_estimation import (
     _update_fusion_filters,
     estimate_sample_into,
     estimated_motion_std,
-    fusion_filters,
-    motion_estimator,
+    fusion_gains,
+    initialize_motion_estimator,
     path_delays,
-    steady_state_kalman_filter,
+    steady_state_kalman_gains,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
@@ -84,11 +84,11 @@ def sampled(
     """Return samples of sensor and estimation; `believed` is the nominal sensor."""
     n = truth.shape[1] - 15
     noise = np.random.default_rng(seed).standard_normal(
-        (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE)
+        (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE)
     )
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
-    chain, chain_memory = sensor_chain_constants(sensor, n, T)
-    constants, memory = motion_estimator(config, believed or sensor, n, T)
+    chain, chain_memory = initialize_sensor_chain(sensor, n, T)
+    constants, memory = initialize_motion_estimator(config, believed or sensor, n, T)
     for k in range(len(truth)):
         read_sensor_into(
             chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
@@ -159,7 +159,7 @@ def test_noiseless_sensor_gives_truth_of_one_earlier_instant(source, tolerance, 
     config = MotionEstimationConfig(source=source)
     t = np.arange(12000) * T
     samples = sampled(truth_of(swinging(t)), sensor, config)[SETTLED:]
-    delay = path_delays(config, sensor, T).sample
+    delay = path_delays(config, sensor, T).sample_s
     earlier = truth_of(swinging(t[SETTLED:] - delay))
     got = np.hstack([samples[:, :15], samples[:, 16:]])
     error = np.abs(got - earlier).max(axis=0) / np.abs(earlier).max(axis=0)
@@ -237,7 +237,7 @@ def test_wrench_and_motion_are_in_phase(source, preset, frequency):
     strong = np.abs(true) > 0.05 * np.repeat([np.abs(true[:3]).max(), np.abs(true[3:]).max()], 3)
     assert np.abs(mismatch[strong] - expected).max() < 0.02
     lateness = -np.angle(measured / true) / per_sample
-    delay = path_delays(config, sensor, T).sample / T
+    delay = path_delays(config, sensor, T).sample_s / T
     assert np.abs(lateness[strong] - delay).max() < 0.05
 
 
@@ -247,14 +247,14 @@ def test_the_delays_add_up():
     )
     low_pass = 1 / (2 * np.pi * 500) / np.sin(np.pi / 8)  # sum of 2 zeta of a Butterworth
     delays = path_delays(MotionEstimationConfig("fused"), sensor, T)
-    assert delays.wrench == pytest.approx(low_pass + 1e-3, abs=0.1 * T)
-    assert delays.acceleration == delays.sample == pytest.approx(delays.wrench + 2e-3)
-    assert delays.encoders == pytest.approx(delays.wrench + 1e-3)
+    assert delays.wrench_s == pytest.approx(low_pass + 1e-3, abs=0.1 * T)
+    assert delays.acceleration_s == delays.sample_s == pytest.approx(delays.wrench_s + 2e-3)
+    assert delays.encoders_s == pytest.approx(delays.wrench_s + 1e-3)
     encoders = path_delays(MotionEstimationConfig("encoders", 50.0), sensor, T)
-    assert encoders.encoders == pytest.approx(11 * low_pass + 2e-3, abs=0.2 * T)
-    assert 0 <= encoders.sample - encoders.encoders < T
-    assert (encoders.sample - encoders.wrench) / T == pytest.approx(
-        round((encoders.sample - encoders.wrench) / T)
+    assert encoders.encoders_s == pytest.approx(11 * low_pass + 2e-3, abs=0.2 * T)
+    assert 0 <= encoders.sample_s - encoders.encoders_s < T
+    assert (encoders.sample_s - encoders.wrench_s) / T == pytest.approx(
+        round((encoders.sample_s - encoders.wrench_s) / T)
     )
 
 
@@ -292,13 +292,13 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
 @given(st.floats(-7, -3), st.floats(-3, 1), st.floats(-4, 2), st.sampled_from([T, 1e-3, 1e-2]))
 def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period):
     position_std, white, walk = 10.0**position, 10.0**acceleration, 10.0**drift
-    found = steady_state_kalman_filter(position_std, white, walk, period)
+    found = steady_state_kalman_gains(position_std, white, walk, period)
     # In samples and standard deviations of the position.
     F, h = np.array([[1.0, 1, 1], [0, 1, 1], [0, 0, 1]]), np.array([[1.0, 0, 0]])
     noise = white * period**2 / position_std * np.array([1.0, 1.0, 0.0])
     Q = np.outer(noise, noise)
     Q[2, 2] = (walk * period**2.5 / position_std) ** 2
-    gains = found.gains * [1, period, period**2]
+    gains = found * [1, period, period**2]
     # The gains are a fixed point of the Riccati equation: the covariance of the filter that has
     # them, a linear equation, gives them back.
     A = (np.eye(3) - gains[:, None] * h) @ F
@@ -308,14 +308,14 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
     P = np.linalg.solve(np.eye(9) - np.kron(A, A), N.ravel()).reshape(3, 3)
     ahead = F @ P @ F.T + Q
     np.testing.assert_allclose(ahead[:, 0] / (ahead[0, 0] + 1), gains, rtol=1e-3)
-    assert found.position_std == pytest.approx(position_std * np.sqrt(P[0, 0]), rel=1e-3)
-    assert found.innovation_std == pytest.approx(position_std * np.sqrt(ahead[0, 0] + 1), rel=1e-3)
+    assert gains[0] == pytest.approx(P[0, 0], rel=2e-3)
+    assert 1 / (1 - gains[0]) == pytest.approx(ahead[0, 0] + 1, rel=2e-3)
 
 
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
     """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
-    gains = steady_state_kalman_filter(position_std, acceleration_std, 1e-3, T).gains
+    gains = steady_state_kalman_gains(position_std, acceleration_std, 1e-3, T)
     crossover = np.sqrt(acceleration_std / position_std)
     assert gains[0] == pytest.approx(np.sqrt(2) * crossover * T, rel=0.05)
     assert gains[1] == pytest.approx(crossover**2 * T, rel=0.05)
@@ -323,7 +323,7 @@ def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
 
 def test_filter_errors_equal_the_predicted_deviations():
     position_std, white, walk, steps = 7e-6, 1.5, 3.0, 60000
-    found = steady_state_kalman_filter(position_std, white, walk, T)
+    gains = steady_state_kalman_gains(position_std, white, walk, T)
     random = np.random.default_rng(1)
     error = np.cumsum(walk * np.sqrt(T) * random.standard_normal((steps, 3)), axis=0)
     # True acceleration zero: what is measured is error and noise, and rate and angle stay zero.
@@ -332,19 +332,20 @@ def test_filter_errors_equal_the_predicted_deviations():
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
     for k in range(1, steps):
         acceleration, moved = measured[k] - bias, angle[k] - angle[k - 1]
-        _update_fusion_filters(found.gains, T, moved, acceleration, kept)
+        _update_fusion_filters(gains, T, moved, acceleration, kept)
         bias -= moved
         kept[6:9] = acceleration + moved
         estimates.append(angle[k] - kept[:3])
-        innovations.append(moved / found.gains[2])
-    assert np.std(estimates[8000:]) == pytest.approx(found.position_std, rel=0.04)
-    assert np.std(innovations[8000:]) == pytest.approx(found.innovation_std, rel=0.01)
+        innovations.append(moved / gains[2])
+    assert np.std(estimates[8000:]) == pytest.approx(position_std * np.sqrt(gains[0]), rel=0.04)
+    innovation_std = position_std / np.sqrt(1 - gains[0])
+    assert np.std(innovations[8000:]) == pytest.approx(innovation_std, rel=0.01)
 
 
 def test_gains_of_the_jr3_equal_the_docs():
-    angular, linear = fusion_filters(MotionEstimationConfig(), JR3, 6, T)
-    assert angular.crossover_hz == pytest.approx(28.9, abs=0.1)
-    assert linear.crossover_hz == pytest.approx(18.4, abs=0.1)
+    angular, linear = fusion_gains(MotionEstimationConfig(), JR3, 6, T)
+    assert np.cbrt(angular[2] / T) / (2 * np.pi) == pytest.approx(28.9, abs=0.1)
+    assert np.cbrt(linear[2] / T) / (2 * np.pi) == pytest.approx(18.4, abs=0.1)
 
 
 # What the elimination leaves of the paper's 100 N
@@ -369,8 +370,8 @@ def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
     assert plain["fused"][1] < 1.0 and off["fused"][1] < 1.0
     # Encoders leave less, 8 ms later.
     assert plain["encoders"][0] < plain["fused"][0]
-    late = path_delays(MotionEstimationConfig("encoders"), sensor, T).sample
-    assert late > 8e-3 + path_delays(MotionEstimationConfig(), sensor, T).sample
+    late = path_delays(MotionEstimationConfig("encoders"), sensor, T).sample_s
+    assert late > 8e-3 + path_delays(MotionEstimationConfig(), sensor, T).sample_s
 
 
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
@@ -403,7 +404,7 @@ def test_the_offset_of_an_accelerometer_is_found(fast):
 
 def test_flag_stays_while_part_of_the_reading_is_delayed():
     sensor = dataclasses.replace(QUIET, acceleration_latency=1e-3)
-    constants, memory = motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
+    constants, memory = initialize_motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
     reading, sample, flags = np.zeros(19), np.zeros(22), []
     reading[13:] = home()
     for k in range(40):
@@ -415,4 +416,4 @@ def test_flag_stays_while_part_of_the_reading_is_delayed():
 
 def test_bandwidth_above_the_rate_is_rejected():
     with pytest.raises(DrakeTeleopError, match="encoder_bandwidth_hz"):
-        motion_estimator(MotionEstimationConfig("encoders", 500.0), JR3, 6, 1e-3)
+        initialize_motion_estimator(MotionEstimationConfig("encoders", 500.0), JR3, 6, 1e-3)

@@ -20,16 +20,16 @@ from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.sensor.presets import PRESETS, preset_of_block
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     OFFSET_CONSTANTS,
     PARTS,
     PRESET_NAMES,
     SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
+    are_values_plausible,
     calibration_matrices,
-    is_plausible,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
     without_parts,
 )
 
@@ -48,13 +48,13 @@ UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
 
 
 def readings(config, truths, noise=None, period=PERIOD):
-    """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
+    """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_BLOCK_SIZE)."""
     blocks = (
-        np.zeros((-(-len(truths) // SAMPLES_PER_NOISE_BLOCK), NOISE_SIZE))
+        np.zeros((-(-len(truths) // SAMPLES_PER_NOISE_BLOCK), NOISE_BLOCK_SIZE))
         if noise is None
         else noise
     )
-    constants, memory = sensor_chain_constants(config, truths.shape[1] - 15, period)
+    constants, memory = initialize_sensor_chain(config, truths.shape[1] - 15, period)
     out = np.empty((len(truths), truths.shape[1] - 2))
     for k, truth in enumerate(truths):
         read_sensor_into(constants, memory, blocks[k // SAMPLES_PER_NOISE_BLOCK], truth, out[k])
@@ -72,7 +72,7 @@ def random_truths(count, seed=0, joints=JOINTS):
 
 def random_noise(count, seed=1):
     blocks = -(-count // SAMPLES_PER_NOISE_BLOCK)
-    return np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
+    return np.random.default_rng(seed).standard_normal((blocks, NOISE_BLOCK_SIZE))
 
 
 def as_read(truths):
@@ -209,7 +209,7 @@ def test_ramp_is_delayed_by_the_stated_delays(name):
     slopes = np.linspace(1.0, 3.0, 15 + JOINTS)
     t = PERIOD * np.arange(2000)  # the slowest low-pass has 30 Hz
     late = t[-1] - readings(config, t[:, None] * slopes)[-1] / as_read(slopes[None])[0].clip(1e-9)
-    force, acceleration, encoders = config.delays(PERIOD)
+    force, acceleration, encoders = config.reading_delays(PERIOD)
     np.testing.assert_allclose(late[:6], force, atol=1e-9)
     np.testing.assert_allclose(late[6:12], acceleration, atol=1e-9)
     np.testing.assert_allclose(late[13:], encoders, atol=1e-9)
@@ -246,10 +246,10 @@ def test_offset_drifts_and_may_change_during_a_run():
     expected += np.array([*offset, *bias])
     np.testing.assert_allclose(error, expected, atol=1e-12)
 
-    constants, memory = sensor_chain_constants(part(offset=offset), JOINTS, PERIOD)
+    constants, memory = initialize_sensor_chain(part(offset=offset), JOINTS, PERIOD)
     constants[OFFSET_CONSTANTS] += 5.0
     reading = np.empty(13 + JOINTS)
-    read_sensor_into(constants, memory, np.zeros(NOISE_SIZE), truths[0], reading)
+    read_sensor_into(constants, memory, np.zeros(NOISE_BLOCK_SIZE), truths[0], reading)
     np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
 
 
@@ -291,21 +291,23 @@ def test_the_offset_counts_in_the_saturation(low_pass):
 
 
 def test_overload_including_offset_is_not_plausible():
-    constants, _ = sensor_chain_constants(part(saturates=True), JOINTS, PERIOD)
+    constants, _ = initialize_sensor_chain(part(saturates=True), JOINTS, PERIOD)
     truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
-    assert is_plausible(constants, truth)
+    assert are_values_plausible(constants, truth)
     truth[0] = 0.99 * largest
-    assert is_plausible(constants, truth)
+    assert are_values_plausible(constants, truth)
     constants[0] = 0.02 * largest  # of the offset
-    assert not is_plausible(constants, truth)
+    assert not are_values_plausible(constants, truth)
     truth[0] = 0.0
-    assert is_plausible(constants, truth)
+    assert are_values_plausible(constants, truth)
     constants[0] = np.nan
-    assert not is_plausible(constants, truth)
+    assert not are_values_plausible(constants, truth)
     constants[0] = 0.0
     for place in range(len(truth)):
         for bad in (np.nan, -np.inf, 1e9):
-            assert not is_plausible(constants, np.where(np.arange(len(truth)) == place, bad, truth))
+            assert not are_values_plausible(
+                constants, np.where(np.arange(len(truth)) == place, bad, truth)
+            )
 
 
 # Latency
@@ -320,7 +322,7 @@ def test_each_path_is_late_by_its_whole_samples(late, joints):
         acceleration_latency=max(acceleration - 0.4, 0) * PERIOD,
         encoder_latency=encoders * PERIOD,
     )
-    assert config.latencies(PERIOD).tolist() == late
+    assert config.latency_samples(PERIOD).tolist() == late
     truths = random_truths(100, joints=joints)
     found, expected = readings(config, truths), as_read(truths)
     columns = np.repeat(late[:2], 6).tolist() + [0] + [encoders] * joints
@@ -331,8 +333,8 @@ def test_each_path_is_late_by_its_whole_samples(late, joints):
 
 def test_the_ideal_sensor_is_never_late():
     config = dataclasses.replace(PRESETS["ati_gamma_imu"], ideal=True)
-    assert not config.delays(PERIOD).any() and not config.latencies(PERIOD).any()
-    place, axes = config.accelerometer()
+    assert not config.reading_delays(PERIOD).any() and not config.latency_samples(PERIOD).any()
+    place, axes = config.accelerometer_pose()
     assert not place.any() and np.array_equal(axes, np.eye(3))
 
 

@@ -87,8 +87,8 @@ def _analyze_in_stages(
     free = linearize(linear.without_environment(), load_estimate=estimate)
     progress(0.5)
     points = [("free motion", free, axis)]
-    if scenario.leaf is not None:
-        alone = replace(linear.without_environment(), sheet_spring=scenario.leaf)
+    if scenario.first_sheet_spring is not None:
+        alone = replace(linear.without_environment(), sheet_spring=scenario.first_sheet_spring)
         pressed = linearize(
             alone, load_estimate=estimate, displacement=displacement_into_leaf(alone)
         )
@@ -151,7 +151,7 @@ def _analyze_in_stages(
 
 def describe_wall(scenario: Scenario, is_known: bool) -> str:
     """Return the source of the analysed wall stiffness as text."""
-    if scenario.leaf is not None:
+    if scenario.first_sheet_spring is not None:
         return "the leaf"
     surroundings = scenario.surroundings
     if is_known:
@@ -173,7 +173,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 def displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the master's displacement [m] in its base frame B that bends the leaf by 5 mm."""
-    assert scenario.leaf is not None
+    assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
         raise DrakeTeleopError(
@@ -182,7 +182,9 @@ def displacement_into_leaf(scenario: Scenario) -> list[float]:
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
     tip = NominalSlave(scenario.slave).start_tip
-    displacement = np.array(scenario.leaf.position) - [0.0, 0.0, _LEAF_DEFLECTION_M] - tip
+    displacement = (
+        np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _LEAF_DEFLECTION_M] - tip
+    )
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)
 

@@ -91,7 +91,7 @@ def task_direction(
     mass, first_moment_S = arm.phi_load[0], arm.phi_load[1:4]
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
-    servo, sheet = scenario.joint_control, scenario.leaf
+    servo, sheet = scenario.joint_control, scenario.first_sheet_spring
     servo.check_computed_torque("the model of one axis")
     scenario.master.check_pose_mode("the model of one axis")
     forward, backward = scenario.channel.networks_of_directions()
@@ -118,8 +118,8 @@ def task_direction(
 
 
 def _wall_stiffness(scenario: Scenario) -> float:
-    if scenario.leaf is not None:
-        return float(scenario.leaf.stiffness)
+    if scenario.first_sheet_spring is not None:
+        return float(scenario.first_sheet_spring.stiffness)
     wall = scenario.surroundings
     if not isinstance(wall, Wall):
         return 0.0

@@ -39,8 +39,8 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.oscillation import high_pass
-from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
+from drake_teleop.station.oscillation import high_pass_above_5_hz
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, step_addresses
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
 from drake_teleop.station.simulation import (
@@ -176,7 +176,7 @@ def simulate_press(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    fast = high_pass(result.t[held], result["force_to_master"][held, :3])
+    fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
@@ -213,7 +213,7 @@ def _run_one_dof_study(
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
-        steps_of(method)
+        step_addresses(method)
     seeds = range(seed, seed + 2)
     found = _run_parallel(
         longest_round_trip,

@@ -18,7 +18,7 @@ from drake_teleop.lab.analysis.one_axis import Axis
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
     MASTER_METHOD_MEMORY,
-    NUM_PORT_SIGNALS,
+    PORTS_SIGNAL_SIZE,
     SLAVE_METHOD_MEMORY,
     initial_state_of_ends,
     step_channel,
@@ -210,8 +210,8 @@ def run_one_dof(
     # command over it.
     held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
     rows = _simulate_steps(
-        methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
-        ends, start, timeout, np.concatenate(course, axis=1),
+        methods.step_addresses(passivity.method), tuple(map(float, numbers)), held, p, *lines,
+        *states, ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD
     master, slave, command, felt, pushed = rows.T[:5]
@@ -342,7 +342,7 @@ def _simulate_steps(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
-    felt, ports = np.zeros(7), np.zeros(NUM_PORT_SIGNALS)
+    felt, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
     # Columns: master, slave, command, felt, wall, energy (2), silent (2), accounts (4).
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]

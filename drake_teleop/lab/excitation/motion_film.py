@@ -17,7 +17,7 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.station.film import (
+from drake_teleop.station.replay_file import (
     DisplayedNumber,
     ReplayFile,
     ShowFrame,
@@ -56,8 +56,8 @@ def write_motion_film(path: Path, found: Excitation) -> None:
             DisplayedNumber("Speed of the sensor", "m/s", speed),
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
-        clock="of the motion",
-        curves="force at the sensor, 0 to {top} N",
+        clock_label="of the motion",
+        curves_label="force at the sensor, 0 to {top} N",
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
@@ -66,9 +66,9 @@ def write_motion_film(path: Path, found: Excitation) -> None:
         )
         _AddLinks(meshcat, robot, context)
 
-        def show(film_time: float, frame: int) -> None:
+        def show(replay_time: float, frame: int) -> None:
             for body, X_WB in poses[frame][0].items():
-                meshcat.SetTransform(f"/arm/{int(body)}", X_WB, film_time)
+                meshcat.SetTransform(f"/arm/{int(body)}", X_WB, replay_time)
 
         return show
 

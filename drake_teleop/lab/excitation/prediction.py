@@ -15,8 +15,7 @@ from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    SteadyStateFilter,
-    fusion_filters,
+    fusion_gains,
 )
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
@@ -50,9 +49,9 @@ def sensor_noise(
     if estimation.source == "accelerometer":
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
-        angular, linear = fusion_filters(estimation, sensor, num_joints, period)
+        angular, linear = fusion_gains(estimation, sensor, num_joints, period)
         filters = _error_filter(linear, period), _error_filter(angular, period)
-    place = sensor.accelerometer()[0]
+    place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
 
@@ -93,8 +92,8 @@ def _covariance_of_influence(influence: Array, variances: Array) -> Array:
     return rows.T @ rows
 
 
-def _error_filter(filter_: SteadyStateFilter, period: float) -> tuple[Array, Array]:
-    denominator = np.array([1.0, *(filter_.gains / period)])
+def _error_filter(gains: Array, period: float) -> tuple[Array, Array]:
+    denominator = np.array([1.0, *(gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
 

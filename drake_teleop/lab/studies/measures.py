@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.operator.task import TASK_MEASURES
+from drake_teleop.station.operator.task import TASK_MEASURE_NAMES
 from drake_teleop.station.result import SimulationResult
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = 
 
 
 #: Names of all measures; for those of tasks see `task_measures.py`.
-MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURES)
+MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURE_NAMES)
 
 
 def default_measures() -> list[str]:

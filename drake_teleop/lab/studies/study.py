@@ -21,12 +21,12 @@ from drake_teleop.lab.studies.measures import evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.lab.studies.shards import parse_shard
 from drake_teleop.station.scenario import (
-    ReadScenario,
+    ReadScenarioData,
     Scenario,
     ScenarioFromData,
     ScenarioNames,
+    find_shipped_file,
     settings_from_data,
-    shipped_file,
 )
 
 if TYPE_CHECKING:
@@ -92,10 +92,10 @@ def study_command(
                 where=str(path),
                 remedy="remove one of them",
             )
-    study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
+    study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)
-    data, where = ReadScenario(_scenario_path(study, path))
+    data, where = ReadScenarioData(_scenario_path(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_factor_values(factor, f"{path}:factors[{index}]")
@@ -121,7 +121,7 @@ def study_command(
 
 def LoadStudy(path: str | Path) -> Study:
     """Load a study file and check everything that does not depend on the scenario."""
-    path = shipped_file("study", path, studies_dir())
+    path = find_shipped_file("study", path, studies_dir())
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study

@@ -20,8 +20,8 @@ from drake_teleop.station.scenario import (
     LoadScenario,
     Scenario,
     ScenarioNames,
+    find_shipped_file,
     settings_from_data,
-    shipped_file,
 )
 
 _EXPERIMENTS_FOLDER = Path(__file__).parent
@@ -168,7 +168,7 @@ class Experiment:
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
-    path = shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
+    path = find_shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
     experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
     return experiment, [

@@ -20,7 +20,7 @@ from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.station.channel.channel import (
     MIN_TIMEOUT_S,
-    NUM_PORT_SIGNALS,
+    PORTS_SIGNAL_SIZE,
     initial_state_of_ends,
     step_master_end,
     step_slave_end,
@@ -61,11 +61,11 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         frame = np.concatenate([rotation.ravel(), scales])
-        self._method = methods.steps_of(passivity.method)
+        self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, frame, parameters
         ends = initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
-        results = [ends, start, np.zeros(NUM_PORT_SIGNALS), np.zeros(7), np.zeros(PACKET_SIZE)]
+        results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUTS]
         self._groups = [int(self.DeclareDiscreteState(part)) for part in results[:3]]

@@ -40,7 +40,7 @@ from drake_teleop.station.passivity.packet import (
 )
 from drake_teleop.station.passivity.safe_state import (
     MASTER_MONITOR_SIZE,
-    SILENCE_S,
+    SILENCE_TIME,
     SLAVE_MONITOR_SIZE,
     STOP_TIME_S,
     initial_master_monitor,
@@ -49,11 +49,11 @@ from drake_teleop.station.passivity.safe_state import (
     slave_command_into,
 )
 
-_NETWORK_NAMES = ("custom", *PRESETS)
+_NETWORK_CHOICES = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
-_TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
+_TIMEOUT_PER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
 
 
 @settings
@@ -62,7 +62,7 @@ class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
     network: str = choice(
-        "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"
+        "custom", _NETWORK_CHOICES, "a preset, or custom for the network of these fields"
     )
     backward: NetworkConfig | None = plain(
         None, "network from slave to master; null: as from master to slave"
@@ -98,7 +98,7 @@ class Channel(NetworkConfig):
             network.longest_silence(line, direction, period)
             for line, direction in zip(self.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
-        return min(max(_TIMEOUT_FACTOR * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
+        return min(max(_TIMEOUT_PER_LONGEST_SILENCE * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
@@ -109,8 +109,8 @@ _STEP_COUNT = _layout.number()  # number of the step
 _LAST_POSE_AT_MASTER = _layout.vector(8)
 _LAST_POSE_AT_SLAVE = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_WRENCH = _layout.vector(6)  # wrench rendered since the last step
-_VALID_WRENCH_AT_SLAVE = _layout.vector(6)  # slave's wrench at the last step
-_VALID_WRENCH_TIME = _layout.number()  # time with valid wrenches [s]
+_LAST_VALID_WRENCH = _layout.vector(6)  # slave's wrench at the last step
+_TIME_WITH_VALID_WRENCH = _layout.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
 _SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
@@ -119,8 +119,8 @@ _layout = SlotAllocator(11)
 _R_WB_ROWS = _layout.vector(9)  # R_WB by rows
 _MOTION_SCALES = _layout.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
-NUM_PORT_SIGNALS = 8
-_layout = SlotAllocator(NUM_PORT_SIGNALS)
+PORTS_SIGNAL_SIZE = 8
+_layout = SlotAllocator(PORTS_SIGNAL_SIZE)
 _WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
 _SILENCE_TIMES, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
@@ -139,7 +139,7 @@ def initial_state_of_ends(
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
-    ends[_VALID_WRENCH_TIME] = STOP_TIME_S
+    ends[_TIME_WITH_VALID_WRENCH] = STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -199,8 +199,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_S]
-    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_S]
+    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -245,7 +245,7 @@ def step_slave_end(
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
-    before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
+    before, held = ends[_LAST_POSE_AT_SLAVE], ends[_LAST_VALID_WRENCH]
     watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -258,19 +258,19 @@ def step_slave_end(
     load = memory[LOAD_WRENCH]
     if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
-        ends[_VALID_WRENCH_TIME] = 0.0
+        ends[_TIME_WITH_VALID_WRENCH] = 0.0
     elif saturated:
-        ends[_VALID_WRENCH_TIME] = 0.0
+        ends[_TIME_WITH_VALID_WRENCH] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
         _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME_S - ends[_VALID_WRENCH_TIME], T)
+        share = T / max(STOP_TIME_S - ends[_TIME_WITH_VALID_WRENCH], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _convert_wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_VALID_WRENCH_TIME] += T
+        ends[_TIME_WITH_VALID_WRENCH] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[INPUTS_FINITE] > 0.5
     methods.slave_step(
@@ -375,17 +375,10 @@ class TeleopChannel(LeafSystem):
             for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
-        self._steps = methods.steps_of(passivity.method)
+        self._steps = methods.step_addresses(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
-        self._constants = (
-            *(
-                period,
-                channel.timeout_s(period),
-                np.concatenate([R_WB.ravel(), scales]),
-                parameters,
-            ),
-            *lines,
-        )
+        frame = np.concatenate([R_WB.ravel(), scales])
+        self._constants = (period, channel.timeout_s(period), frame, parameters, *lines)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
@@ -398,7 +391,7 @@ class TeleopChannel(LeafSystem):
         receivers, in_transit = zip(
             *(network.initial_network_state(p, carried) for p in lines), strict=True
         )
-        state = [*receivers, ends, np.array(start), np.zeros(NUM_PORT_SIGNALS)]
+        state = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE)]
         self._initial_arguments = (passivity.method, parameters)
         received = np.zeros(7)
         groups = [self.DeclareDiscreteState(part) for part in state]

@@ -36,7 +36,7 @@ _MAX_DELAY_DEVIATIONS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE_POLICIES = ("hold", "zero", "extrapolate")
 _POLICY_ZERO, _POLICY_EXTRAPOLATE = 1, 2
 _TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
-_MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a network
+_SILENCE_SIMULATION_S, _SILENCE_SIMULATION_SEED = 60.0, 20090101  # for `longest_silence`
 
 
 @settings
@@ -102,22 +102,12 @@ stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2
 """
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
-_RANDOM_KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST_DELAY, _BAD_SHARE, _BAD_MEMORY = (
-    range(8)
-)
-(
-    _BURST_LOSS,
-    _DUPLICATE,
-    _RATE,
-    _PLAYOUT_TIME,
-    _REDUNDANT,
-    _NUM_SLOTS,
-    _POLICY,
-    _MIN_DELAY,
-    _TRACE,
-) = range(8, 17)
+_RANDOM_KEY, _PERIOD, _MEAN_DELAY_STEPS, _JITTER, _DISTRIBUTION, _MAX_DELAY_STEPS = range(6)
+_BAD_SHARE, _BAD_PERSISTENCE, _BURST_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = range(6, 11)
+_PLAYOUT_STEPS, _IS_REDUNDANT, _NUM_TRANSIT_SLOTS, _SILENCE_POLICY = range(11, 15)
+_MIN_DELAY_STEPS, _TRACE_START = 15, 16
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
-_BAD_STATE, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
+_IS_BAD_STATE, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
 
 
 def network_parameters(
@@ -138,7 +128,7 @@ def network_parameters(
             repeated after its end.
     """
     config.check()
-    trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
+    trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
     longest = math.floor(
@@ -149,24 +139,20 @@ def network_parameters(
     longest = max(longest, least)
     bad = config.loss / config.burst_loss
     time_constant = config.burst * (1 - bad)  # time constant of the chain
-    p = np.empty(_TRACE + trace.size)
+    p = np.empty(_TRACE_START + trace.size)
     # 53 bits of a key are exact in a float.
     p[_RANDOM_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
-    p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST_DELAY] = period, mean, config.jitter, longest
+    p[_PERIOD], p[_JITTER] = period, config.jitter
+    p[_MEAN_DELAY_STEPS], p[_MAX_DELAY_STEPS] = mean, longest
     p[_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
-    p[_BAD_SHARE], p[_BAD_MEMORY] = (
-        bad,
-        math.exp(-period / time_constant) if time_constant > 0 else 0.0,
-    )
-    p[_BURST_LOSS], p[_DUPLICATE] = config.burst_loss, config.duplicate
-    p[_RATE] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
-    p[_PLAYOUT_TIME], p[_REDUNDANT], p[_NUM_SLOTS] = (
-        playout,
-        config.redundant,
-        max(longest, playout) + 1,
-    )
-    p[_POLICY], p[_MIN_DELAY] = _SILENCE_POLICIES.index(config.silence), least
-    p[_TRACE:] = trace
+    p[_BAD_SHARE] = bad
+    p[_BAD_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
+    p[_BURST_LOSS], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
+    p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
+    p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
+    p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
+    p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), least
+    p[_TRACE_START:] = trace
     return p
 
 
@@ -174,7 +160,7 @@ def mean_delay(config: NetworkConfig) -> float:
     """Return the mean one-way delay of arriving packets, at least the playout time [s]."""
     if config.trace is None:
         return max(config.delay, config.playout)
-    delays = _read_trace(Path(config.trace), _TRACE_STEP_S) * _TRACE_STEP_S
+    delays = _read_delay_trace(Path(config.trace), _TRACE_STEP_S) * _TRACE_STEP_S
     used = np.maximum(delays[delays >= 0], config.playout)
     return float(used.mean()) if used.size else config.playout
 
@@ -183,11 +169,11 @@ def longest_delay(config: NetworkConfig) -> float:
     """Return the largest age of an arriving packet when the receiver uses it [s]."""
     longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
     if config.trace is not None:
-        longest = float(_read_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
+        longest = float(_read_delay_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
     return max(longest, config.playout)
 
 
-def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
+def _read_delay_trace(path: Path, period: float) -> NDArray[np.float64]:
     """Return a trace file's delays (N,) [steps], one packet a period; -1 for a lost packet."""
     # The table reader starts slowly and is needed only for a trace.
     from drake_teleop.logs.read.table_files import read_table
@@ -199,13 +185,10 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
         what = f"has {len(delay)} values, the column time has {len(time)}"
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
+    too_late = f"is more than {MAX_TRACE_DURATION_S:g} s after the first"
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
-        (
-            "time",
-            age > MAX_TRACE_DURATION_S,
-            f"is more than {MAX_TRACE_DURATION_S:g} s after the first",
-        ),
+        ("time", age > MAX_TRACE_DURATION_S, too_late),
         ("delay", (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():
@@ -227,12 +210,12 @@ def _random_uniform(p, k, draw):
 @njit(cache=True)
 def _draw_delay_steps(p, k, draw):
     """Return the delay of packet k [steps] from random numbers `draw` to `draw` + 2; -1: lost."""
-    if p.shape[0] > _TRACE:
-        steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
-        return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
-    mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
+    if p.shape[0] > _TRACE_START:
+        steps = p[_TRACE_START + k % (p.shape[0] - _TRACE_START)]
+        return int(max(steps, p[_MIN_DELAY_STEPS])) if steps >= 0.0 else -1
+    mean, spread = p[_MEAN_DELAY_STEPS], p[_MEAN_DELAY_STEPS] * p[_JITTER]
     if spread == 0.0:
-        return int(p[_LONGEST_DELAY])
+        return int(p[_MAX_DELAY_STEPS])
     u = _random_uniform(p, k, draw)
     if p[_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
@@ -242,22 +225,23 @@ def _draw_delay_steps(p, k, draw):
     else:  # sum of three exponential waits
         u *= _random_uniform(p, k, draw + 1) * _random_uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
-    return int(min(max(delay + 0.5, p[_MIN_DELAY]), p[_LONGEST_DELAY]))
+    return int(min(max(delay + 0.5, p[_MIN_DELAY_STEPS]), p[_MAX_DELAY_STEPS]))
 
 
 @njit(cache=True)
-def _advance_loss_chain(p, k, bad):
+def _draw_loss_and_delays(p, k, bad):
     """Return the loss state (1: bad) at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
-        likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
+        likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_PERSISTENCE]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
-    if p[_RATE] < 1.0 and math.floor(k * p[_RATE] + 1e-9) == math.floor((k - 1) * p[_RATE] + 1e-9):
+    rate = p[_PACKETS_PER_STEP]
+    if rate < 1.0 and math.floor(k * rate + 1e-9) == math.floor((k - 1) * rate + 1e-9):
         return bad, -1, -1
     if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BURST_LOSS]:
         return bad, -1, -1
     first = _draw_delay_steps(p, k, 2)
     second = -1
-    if first >= 0 and p[_DUPLICATE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE]:
+    if first >= 0 and p[_DUPLICATE_SHARE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE_SHARE]:
         second = _draw_delay_steps(p, k, 6)
     return bad, first, second
 
@@ -269,7 +253,7 @@ def initial_network_state(
 
     `neutral` (N,) contains the values at the receiver before the first packet.
     """
-    slots = int(p[_NUM_SLOTS])
+    slots = int(p[_NUM_TRANSIT_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
     return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
 
@@ -278,12 +262,12 @@ def initial_network_state(
 def send_packet(p, state, k, packet):
     """Send `packet` at step `k` and update `state`; call this for every step from 0 on."""
     receiver, in_transit = state
-    slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
-    receiver[_BAD_STATE], first, second = _advance_loss_chain(p, k, receiver[_BAD_STATE])
+    slots, size = int(p[_NUM_TRANSIT_SLOTS]), receiver.shape[0] - _LAST_PACKET
+    receiver[_IS_BAD_STATE], first, second = _draw_loss_and_delays(p, k, receiver[_IS_BAD_STATE])
     for travel in (first, second):
         if travel >= 0:
-            if p[_REDUNDANT] == 0.0:
-                travel = max(travel, int(p[_PLAYOUT_TIME]))
+            if p[_IS_REDUNDANT] == 0.0:
+                travel = max(travel, int(p[_PLAYOUT_STEPS]))
             # The previous content of the slot is older.
             in_transit[(k + travel) % slots] = k
     # A lost packet is written too, because a later redundant packet may contain it.
@@ -297,12 +281,12 @@ def receive_packet(p, state, k, packet):
     Return the step at which it was sent (-1: none), and True if it is new.
     """
     receiver, in_transit = state
-    slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
+    slots, size = int(p[_NUM_TRANSIT_SLOTS]), receiver.shape[0] - _LAST_PACKET
     # An old entry of the slot is smaller and has no effect.
     receiver[_NEWEST_ARRIVED] = max(receiver[_NEWEST_ARRIVED], in_transit[k % slots])
     newest = receiver[_NEWEST_ARRIVED]
-    if p[_REDUNDANT] != 0.0:
-        newest = min(newest, k - p[_PLAYOUT_TIME])
+    if p[_IS_REDUNDANT] != 0.0:
+        newest = min(newest, k - p[_PLAYOUT_STEPS])
     fresh = newest > receiver[_NEWEST_READ]
     if fresh:
         receiver[_NEWEST_READ], receiver[_SILENT_STEPS] = newest, 0.0
@@ -311,7 +295,7 @@ def receive_packet(p, state, k, packet):
         receiver[_SILENT_STEPS] += 1.0
     copy_into(packet, 0, receiver, _LAST_PACKET, size)
     if not fresh:
-        _apply_silence_policy(p[_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
+        _apply_silence_policy(p[_SILENCE_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
     return int(receiver[_NEWEST_READ]), fresh
 
 
@@ -327,18 +311,12 @@ def _apply_silence_policy(policy, silent, packet):
             velocity[:] = 0.0
 
 
-def packet_delays(
-    config: NetworkConfig, seed: int, direction: int, steps: int, period: float
-) -> NDArray[np.int64]:
-    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
-    return _compute_packet_delays(network_parameters(config, seed, direction, period), steps)
-
-
 @njit(cache=True)
-def _compute_packet_delays(p, steps):
+def packet_delays(p, steps):
+    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
     delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
     for k in range(steps):
-        bad, delays[k, 0], delays[k, 1] = _advance_loss_chain(p, k, bad)
+        bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
     return delays
 
 
@@ -347,8 +325,8 @@ def newest_packets(
 ) -> NDArray[np.int64]:
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = network_parameters(config, seed, direction, period)
-    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_TIME])
-    for travel in _compute_packet_delays(p, steps).T:
+    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_STEPS])
+    for travel in packet_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])
@@ -358,7 +336,7 @@ def newest_packets(
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
     """Return the longest time without a new packet in a simulated minute with a fixed seed [s]."""
-    steps = math.ceil((_MINUTE_S + longest_delay(config)) / period)
-    newest = newest_packets(config, _SILENCE_SEED, direction, steps, period)
+    steps = math.ceil((_SILENCE_SIMULATION_S + longest_delay(config)) / period)
+    newest = newest_packets(config, _SILENCE_SIMULATION_SEED, direction, steps, period)
     fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)
     return float(np.diff(fresh, append=steps).max(initial=0) * period) if len(fresh) else math.inf

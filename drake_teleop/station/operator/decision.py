@@ -15,7 +15,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
 from drake_teleop.station.operator.minimum_jerk import (
     PLAN_SIZE,
-    PLAN_START,
+    PLAN_START_INDEX,
     STOP_DURATION_S,
     evaluate_plan,
     plan_move,
@@ -23,7 +23,7 @@ from drake_teleop.station.operator.minimum_jerk import (
 )
 from drake_teleop.station.operator.perception import (
     CONTACT_NOTICED_INDEX,
-    THRESHOLD_INDEX,
+    DETECTION_THRESHOLD_INDEX,
     Perception,
 )
 from drake_teleop.station.operator.task import (
@@ -45,11 +45,11 @@ DECISION_PERIOD_S = 0.005
 
 # Indices of a packed task.
 _TASK_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
-_STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK_SIZE = 11, 12, 13, 14, 15
+_STANDOFF, _SET_FORCE, _TOLERANCE, _SLOT_DEPTH, _TASK_SIZE = 11, 12, 13, 14, 15
 _OPERATOR_RANDOM_STREAM = 2  # random stream; the network's lines use others
 # Indices of a packed person: training, movement and perception.
-_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _RANDOM_KEY = 0, 1, 2, 3, 4
-_ACCELERATION, _MIN_DURATION, _NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
+_MOTION_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _RANDOM_KEY = 0, 1, 2, 3, 4
+_PEAK_ACCELERATION, _MIN_MOVE_DURATION, _MOTOR_NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
 _VISION_NOISE, _DEPTH_ERROR = 10, 11
 _AIM_ERROR, _WEBER_FRACTION, _R_WB = 12, 13, 14
 
@@ -62,21 +62,21 @@ class OperatorTraining:
         R_WB: (3, 3) orientation of the master's base in the world.
         translation_scale: displacement of the tool over displacement of the hand.
         force_gain: rendered force over true contact force.
-        forward, backward: mean one-way delays [s].
+        forward_delay_s, backward_delay_s: mean one-way delays [s].
     """
 
     R_WB: Array
     translation_scale: float
     force_gain: float
-    forward: float
-    backward: float
+    forward_delay_s: float
+    backward_delay_s: float
     seed: int
 
 
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: Movement
 ) -> Array:
-    there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
+    there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM))
     return np.array(
@@ -94,29 +94,26 @@ def pack_operator_parameters(
 
 def pack_task_parameters(task: Task) -> Array:
     packed = np.zeros(_TASK_SIZE)
-    packed[[_TASK_KIND, _T_START, _TIMEOUT]] = (
-        TASK_CLASSES.index(type(task)),
-        task.t_start,
-        task.timeout,
-    )
+    packed[_TASK_KIND] = TASK_CLASSES.index(type(task))
+    packed[[_T_START, _TIMEOUT]] = task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
-    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.distance
+    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.target_distance
     if isinstance(task, Reach):
         packed[[_TARGET_RADIUS, _DWELL]] = task.width / 2, task.dwell
         return packed
     packed[[_TARGET_RADIUS, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
     packed[_DWELL] = task.hold if isinstance(task, Press) else task.dwell
     if isinstance(task, Press):
-        packed[[_FORCE, _TOLERANCE]] = task.force, task.tolerance
+        packed[[_SET_FORCE, _TOLERANCE]] = task.force, task.tolerance
     if isinstance(task, Insert):
         packed[_AXIS : _AXIS + 3] = 0.0, 0.0, -1.0
-        packed[[_FORCE, _DEPTH]] = task.push, task.depth
+        packed[[_SET_FORCE, _SLOT_DEPTH]] = task.push, task.depth
     return packed
 
 
 # Indices of `state` in `update_decision`.
 PHASE_INDEX, OUTCOME_INDEX, CONTACT_PERCEIVED_INDEX = range(3)
-FORCE_LIMIT_INDEX, TRUST_INDEX, STATE_SIZE = range(3, 6)
+FORCE_THRESHOLD_INDEX, CONTACT_TRUST_INDEX, STATE_SIZE = range(3, 6)
 """Indices of the signal task_state, and its size."""
 (
     PHASE_WAITING,
@@ -132,15 +129,16 @@ search for the slot; finished or given up."""
 # Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
 # else -1; estimated contact stiffness; force and displacement of the last press; number of
 # searches; plan.
-_STEP, _NEXT_TIME, _MET_SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES = range(7)
-MEMORY_SIZE = PLAN_START + PLAN_SIZE
+_STEP_COUNT, _NEXT_MOVE_TIME, _MET_SINCE, _ASSUMED_STIFFNESS = range(4)
+_LAST_FORCE, _LAST_MOVE, _SEARCHES = range(4, 7)
+MEMORY_SIZE = PLAN_START_INDEX + PLAN_SIZE
 
 _FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
-_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
+_MOVE_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
 _APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
 # Perceived depth without contact beyond which the operator gives up, estimate.
-_MAX_PENETRATION_M = 0.03
-_MIN_TRUST = 0.1  # trust with vision only, estimate
+_GIVE_UP_PENETRATION_M = 0.03
+_MIN_CONTACT_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
@@ -148,13 +146,14 @@ _STUCK_FORCE_SHARE = 0.5  # share of the push force above which the peg is stuck
 # Compliance to lateral force [N/m], largest yield [m], estimates.
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
-_SEARCH_SPIRAL_PITCH_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963
+_SEARCH_SPIRAL_SCALE_M, _GOLDEN_ANGLE_RAD = 0.5e-3, 2.399963
 _DEPTH_SHARE_AT_FLOOR = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN_START + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
+    memory[_MET_SINCE], memory[_ASSUMED_STIFFNESS] = -1.0, _INITIAL_STIFFNESS
+    memory[PLAN_START_INDEX + 1] = 1.0
     return memory
 
 
@@ -163,7 +162,7 @@ def _convert_to_hand_motion(person, vector_W, out):
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
-            out[i] += person[_R_WB + 3 * k + i] * vector_W[k] / person[_SCALE]
+            out[i] += person[_R_WB + 3 * k + i] * vector_W[k] / person[_MOTION_SCALE]
 
 
 @njit(cache=True)
@@ -188,10 +187,10 @@ def _plan_submovement(person, memory, step, time, error_W):
     _convert_to_hand_motion(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
-    duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_ACCELERATION])
-    duration = max(duration, person[_MIN_DURATION])
+    duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_PEAK_ACCELERATION])
+    duration = max(duration, person[_MIN_MOVE_DURATION])
     for i in range(3):
-        change[i] += person[_NOISE] * length * _draw_normal_number(person, step, i)
+        change[i] += person[_MOTOR_NOISE] * length * _draw_normal_number(person, step, i)
     plan_move(memory, time, duration, change, np.zeros(3))
     return duration
 
@@ -208,7 +207,7 @@ def _contact_force_against_axis(task, person, felt):
 
 
 @njit(cache=True)
-def _is_criterion_met(memory, time, good, still_good):
+def _update_criterion_met(memory, time, good, still_good):
     if memory[_MET_SINCE] < 0.0 and good:
         memory[_MET_SINCE] = time
     elif not still_good:
@@ -224,7 +223,7 @@ def _finish_task(state, memory, time, outcome):
 
 @njit(cache=True)
 def _enter_phase(state, memory, phase, ready):
-    state[PHASE_INDEX], memory[_NEXT_TIME], memory[_MET_SINCE] = phase, ready, -1.0
+    state[PHASE_INDEX], memory[_NEXT_MOVE_TIME], memory[_MET_SINCE] = phase, ready, -1.0
 
 
 @njit(cache=True)
@@ -238,17 +237,15 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
             [N]; trust (0.1 to 1) in detecting contact; updated.
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
     """
-    step = int(memory[_STEP])
-    memory[_STEP] += 1.0
-    state[CONTACT_PERCEIVED_INDEX], state[FORCE_LIMIT_INDEX] = (
-        felt[CONTACT_NOTICED_INDEX],
-        felt[THRESHOLD_INDEX],
-    )
+    step = int(memory[_STEP_COUNT])
+    memory[_STEP_COUNT] += 1.0
+    state[CONTACT_PERCEIVED_INDEX] = felt[CONTACT_NOTICED_INDEX]
+    state[FORCE_THRESHOLD_INDEX] = felt[DETECTION_THRESHOLD_INDEX]
     # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
     if person[_FORCE_GAIN] > 0.0:
-        unnoticed = felt[THRESHOLD_INDEX] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
-    state[TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST)
+        unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
+    state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_CONTACT_TRUST)
     if state[PHASE_INDEX] == PHASE_WAITING and time >= task[_T_START]:
         _enter_phase(state, memory, PHASE_MOVING, time)
     if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
@@ -259,27 +256,25 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
         _move_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE_INDEX] == PHASE_APPROACHING:
         _approach_contact(task, person, time, seen_W, felt, state, memory)
-    elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_TIME]:
+    elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_MOVE_TIME]:
         if task[_TASK_KIND] == KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _is_criterion_met(memory, time, True, True)
+            _update_criterion_met(memory, time, True, True)
             and time - memory[_MET_SINCE] >= task[_DWELL]
         ):
             _finish_task(state, memory, time, 1.0)
     elif state[PHASE_INDEX] == PHASE_PRESSING:
-        _control_force(task, person, step, time, felt, state, memory)
-    elif state[PHASE_INDEX] == PHASE_SEARCHING_SLOT and time >= memory[_NEXT_TIME]:
+        _control_press_force(task, person, step, time, felt, state, memory)
+    elif state[PHASE_INDEX] == PHASE_SEARCHING_SLOT and time >= memory[_NEXT_MOVE_TIME]:
         _search_slot(task, person, step, time, seen_W, felt, state, memory)
 
 
 @njit(cache=True)
 def _perceived_target_into(task, person, out):
-    depth = (
-        0.0
-        if task[_TASK_KIND] == KIND_REACH
-        else person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
-    )
+    depth = 0.0
+    if task[_TASK_KIND] != KIND_REACH:
+        depth = person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
         if task[_TASK_KIND] == KIND_INSERT and i < 2:
@@ -287,7 +282,7 @@ def _perceived_target_into(task, person, out):
 
 
 @njit(cache=True)
-def _perceived_depth(task, person, seen_W):
+def _perceived_penetration(task, person, seen_W):
     target, beyond = np.empty(3), -task[_STANDOFF]
     _perceived_target_into(task, person, target)
     for i in range(3):
@@ -304,19 +299,19 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _is_criterion_met(
+    met = _update_criterion_met(
         memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS]
     )
     if task[_TASK_KIND] == KIND_REACH:
         if met and time - memory[_MET_SINCE] >= task[_DWELL]:
             _finish_task(state, memory, time, 1.0)
             return
-    elif met and time >= memory[_NEXT_TIME]:
+    elif met and time >= memory[_NEXT_MOVE_TIME]:
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    if not met and time >= memory[_NEXT_TIME]:
+    if not met and time >= memory[_NEXT_MOVE_TIME]:
         duration = _plan_submovement(person, memory, step, time, error)
-        memory[_NEXT_TIME] = time + duration + person[_VISION_WAIT]
+        memory[_NEXT_MOVE_TIME] = time + duration + person[_VISION_WAIT]
 
 
 @njit(cache=True)
@@ -332,24 +327,24 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         plan_stop(memory, time)
         _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_WAIT])
         return
-    if _perceived_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
+    if _perceived_penetration(task, person, seen_W) > task[_SLOT_DEPTH] + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
-    elif time >= memory[_NEXT_TIME]:
+    elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
-            velocity_W[i] = state[TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
+            velocity_W[i] = state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
         _convert_to_hand_motion(person, velocity_W, speed)
-        plan = memory[PLAN_START : PLAN_START + PLAN_SIZE]
+        plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
         for i in range(3):
             change[i] = 0.5 * _APPROACH_UPDATE_S * (evaluate_plan(plan, time, i)[1] + speed[i])
         plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
-        memory[_NEXT_TIME] = time + _APPROACH_UPDATE_S
+        memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_S
 
 
 @njit(cache=True)
 def _perceived_contact_force(task, person, felt, memory):
     error = person[_WEBER_FRACTION] * _draw_normal_number(
-        person, int(memory[_NEXT_TIME] / DECISION_PERIOD_S), 3
+        person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3
     )
     return (1.0 + error) * _contact_force_against_axis(task, person, felt)
 
@@ -358,27 +353,27 @@ def _perceived_contact_force(task, person, felt, memory):
 def _displacement_to_set_force(task, memory, force):
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
-        stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
-        memory[_STIFFNESS] = min(max(stiffness, _MIN_STIFFNESS), _MAX_STIFFNESS)
-    move = (task[_FORCE] - force) / memory[_STIFFNESS]
+        stiffness = 0.5 * (memory[_ASSUMED_STIFFNESS] + effect / memory[_LAST_MOVE])
+        memory[_ASSUMED_STIFFNESS] = min(max(stiffness, _MIN_STIFFNESS), _MAX_STIFFNESS)
+    move = (task[_SET_FORCE] - force) / memory[_ASSUMED_STIFFNESS]
     move = min(max(move, -_MAX_PRESS_CORRECTION_M), _MAX_PRESS_CORRECTION_M)
     memory[_LAST_FORCE], memory[_LAST_MOVE] = force, move
     return move
 
 
 @njit(cache=True)
-def _control_force(task, person, step, time, felt, state, memory):
+def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
-    error = abs(task[_FORCE] - force)
-    met = _is_criterion_met(
+    error = abs(task[_SET_FORCE] - force)
+    met = _update_criterion_met(
         memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE]
     )
     if met and time - memory[_MET_SINCE] >= task[_DWELL]:
         _finish_task(state, memory, time, 1.0)
-    elif not met and time >= memory[_NEXT_TIME]:
+    elif not met and time >= memory[_NEXT_MOVE_TIME]:
         move = _displacement_to_set_force(task, memory, force)
         duration = _plan_submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
-        memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]
+        memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_WAIT]
 
 
 @njit(cache=True)
@@ -395,9 +390,15 @@ def _lateral_force_into(task, person, felt, out):
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
-    limit = _STUCK_FORCE_SHARE * task[_FORCE]
+    limit = _STUCK_FORCE_SHARE * task[_SET_FORCE]
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
     return _contact_force_against_axis(task, person, felt) >= limit or sideways >= limit
+
+
+@njit(cache=True)
+def _spiral_coordinate(n, k):
+    radius = _SEARCH_SPIRAL_SCALE_M * math.sqrt(n)
+    return radius * math.cos(_GOLDEN_ANGLE_RAD * n - 0.5 * math.pi * k)
 
 
 @njit(cache=True)
@@ -406,13 +407,13 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_depth(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_DEPTH]
-    if deep and abs(force - task[_FORCE]) <= _STUCK_FORCE_SHARE * task[_FORCE]:
+    deep = _perceived_penetration(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_SLOT_DEPTH]
+    if deep and abs(force - task[_SET_FORCE]) <= _STUCK_FORCE_SHARE * task[_SET_FORCE]:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     move, push = np.empty(3), _displacement_to_set_force(task, memory, force)
     sideways = _lateral_force_into(task, person, felt, move)
-    if sideways >= state[FORCE_LIMIT_INDEX] / person[_FORCE_GAIN]:
+    if sideways >= state[FORCE_THRESHOLD_INDEX] / person[_FORCE_GAIN]:
         share = min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
         for i in range(3):
             move[i] *= share
@@ -420,16 +421,9 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         n = memory[_SEARCHES]
         memory[_SEARCHES] += 1.0
         for k in range(2):
-            before = (
-                _SEARCH_SPIRAL_PITCH_M
-                * math.sqrt(n)
-                * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
-            )
-            now = _SEARCH_SPIRAL_PITCH_M * math.sqrt(n + 1)
-            now *= math.cos(_GOLDEN_ANGLE * (n + 1) - 0.5 * math.pi * k)
-            move[k] = now - before
+            move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
     for i in range(3):
         move[i] += push * task[_AXIS + i]
     duration = _plan_submovement(person, memory, step, time, move)
-    memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]
+    memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_WAIT]

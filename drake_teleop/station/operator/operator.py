@@ -29,13 +29,14 @@ from drake_teleop.common.vectors import (
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import OperatorTraining
-from drake_teleop.station.operator.minimum_jerk import add_plan_into
+from drake_teleop.station.operator.minimum_jerk import add_planned_motion_into
 from drake_teleop.station.operator.perception import Perception, update_perception_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
+from drake_teleop.station.passivity.packet import is_vector_finite, limit_group
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
-_MAX_TORQUE_NM = 2.0  # N m, estimate
+_MAX_HAND_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
+_MAX_HAND_TORQUE_NM = 2.0  # N m, estimate
 
 
 @dataclass(frozen=True)
@@ -172,29 +173,17 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 
 @njit(cache=True)
-def unit_pose_into(pose, twist, out):
+def normalize_pose_into(pose, twist, out):
     """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
-    square, rest = 0.0, 0.0
+    square = 0.0
     for k in range(4):
         square += pose[k] * pose[k]
-    for k in range(7):
-        rest += pose[k] - pose[k]  # NaN unless it is finite
-    for k in range(6):
-        rest += twist[k] - twist[k]
-    if not (rest == 0.0 and 0.0 < square < math.inf):
+    if not (is_vector_finite(pose) and is_vector_finite(twist) and 0.0 < square < math.inf):
         return False
     size = math.sqrt(square)
     for k in range(7):
         out[k] = pose[k] / size if k < 4 else pose[k]
     return True
-
-
-@njit(cache=True)
-def _limit_vector_length(vector, limit):
-    length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
-    if length > limit:
-        for k in range(3):
-            vector[k] *= limit / length
 
 
 @njit(cache=True)
@@ -213,8 +202,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit_vector_length(wrench[:3], _MAX_FORCE_N)
-    _limit_vector_length(wrench[3:], _MAX_TORQUE_NM)
+    limit_group(wrench, 0, _MAX_HAND_FORCE_N)
+    limit_group(wrench, 1, _MAX_HAND_TORQUE_NM)
 
 
 @njit(cache=True)
@@ -223,11 +212,11 @@ def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, 
     for k in range(6):
         twist[k] += moving[k]
     if memory.shape[0] > 0:
-        add_plan_into(memory, time, pose, twist)
+        add_planned_motion_into(memory, time, pose, twist)
 
 
 @njit(cache=True, borrows=True)
-def _hand_wrench_at(
+def _hand_wrench_at_time(
     packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
     _intended_or_planned_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
@@ -252,21 +241,13 @@ def _perceive_and_decide(
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
     felt = perceived_forces[step % perceived_forces.shape[0]]
+    period, force, velocity = decision.DECISION_PERIOD_S, hand_wrench[:3], twist[:3]
     update_perception_into(
-        force_memory,
-        senses,
-        decision.DECISION_PERIOD_S,
-        hand_mass,
-        hand_wrench[:3],
-        twist[:3],
-        attentive,
-        felt,
+        force_memory, senses, period, hand_mass, force, velocity, attentive, felt
     )
     # The next entry to be overwritten is the oldest.
-    seen, felt = (
-        seen_displacements[(step + 1) % seen_displacements.shape[0]],
-        perceived_forces[(step + 1) % perceived_forces.shape[0]],
-    )
+    seen = seen_displacements[(step + 1) % seen_displacements.shape[0]]
+    felt = perceived_forces[(step + 1) % perceived_forces.shape[0]]
     decision.update_decision(task, person, time, seen, felt, task_state, memory)
 
 
@@ -344,7 +325,7 @@ class Operator(LeafSystem):
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
         self._seen_displacements = _make_ring_buffer(
-            senses.vision_delay + training.backward, np.zeros(3)
+            senses.vision_delay + training.backward_delay_s, np.zeros(3)
         )
         self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
@@ -397,7 +378,7 @@ class Operator(LeafSystem):
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not unit_pose_into(pose, twist, self._commanded_pose):
+        if not normalize_pose_into(pose, twist, self._commanded_pose):
             raise DrakeTeleopError(
                 f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
                 where="intended_pose",
@@ -406,7 +387,7 @@ class Operator(LeafSystem):
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _hand_wrench_at(
+        _hand_wrench_at_time(
             *self._evaluate_intended_motion(context),
             self._decision_memory(context),
             context.get_time(),
@@ -419,11 +400,9 @@ class Operator(LeafSystem):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        time, pose, memory = (
-            context.get_time(),
-            output.get_mutable_value(),
-            self._decision_memory(context),
-        )
+        time = context.get_time()
+        pose = output.get_mutable_value()
+        memory = self._decision_memory(context)
         _intended_or_planned_motion_into(
             *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist
         )

@@ -19,20 +19,20 @@ from drake_teleop.common.numeric import broadcast_to_rows, finite_array
 Array = NDArray[np.float64]
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
-_PARAMETER_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
-_INITIAL_PARAMETER_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
+_FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
+_INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _FORCE_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
-_FRICTION_SPEED = 0.01  # m/s, v_0, about the value of the device's friction
-_NUM_PARAMETERS = 6
+_FRICTION_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
+_NUM_MODEL_PARAMETERS = 6
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
-_HELD_FORCE_INDEX, _COUNT, _PARAMETERS_START = 12, 13, 14
-_COVARIANCE_START = _PARAMETERS_START + _NUM_PARAMETERS
-MEMORY_SIZE = _COVARIANCE_START + _NUM_PARAMETERS**2
+_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_START = 12, 13, 14
+_COVARIANCE_START = _FORCE_MODEL_START + _NUM_MODEL_PARAMETERS
+MEMORY_SIZE = _COVARIANCE_START + _NUM_MODEL_PARAMETERS**2
 """Size of the memory of `update_perception_into`."""
 
-EXCESS_FORCE_START, THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
+EXCESS_FORCE_START, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
 """Indices of the output of `update_perception_into`, and its size."""
 
 
@@ -66,7 +66,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_COVARIANCE_START:] = np.diag(_INITIAL_PARAMETER_STD**2).ravel()
+    memory[_COVARIANCE_START:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
     return memory
 
 
@@ -83,64 +83,59 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
             contact is detected.
     """
     weber, absolute, fade, smooth = parameters
-    first = memory[_COUNT] == 0.0
+    first = memory[_SAMPLE_COUNT] == 0.0
     for i in range(3):
         if first:
             memory[i], memory[3 + i] = -hand_force[i], velocity[i]
-            memory[_PARAMETERS_START + 3 + i] = -hand_force[i]
+            memory[_FORCE_MODEL_START + 3 + i] = -hand_force[i]
         memory[6 + i], memory[9 + i] = memory[i], memory[3 + i]
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
-    memory[_COUNT] += 1.0
+    memory[_SAMPLE_COUNT] += 1.0
     # Values midway between two samples, where the velocity difference gives the acceleration.
-    speed = _FRICTION_SPEED * _FRICTION_SPEED
+    speed = _FRICTION_SPEED_M_PER_S * _FRICTION_SPEED_M_PER_S
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
-    theta, expected_square, excess_square = memory[_PARAMETERS_START:_COVARIANCE_START], 0.0, 0.0
-    rows, excess = np.zeros((3, _NUM_PARAMETERS)), out[:3]
+    theta, expected_square, excess_square = memory[_FORCE_MODEL_START:_COVARIANCE_START], 0.0, 0.0
+    rows, excess = np.zeros((3, _NUM_MODEL_PARAMETERS)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
         a = (memory[3 + i] - memory[9 + i]) / dt
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3 + i] = a, v, v / speed, 1.0
         felt = 0.5 * (memory[i] + memory[6 + i]) + hand_mass * a
         expected = 0.0
-        for j in range(_NUM_PARAMETERS):
+        for j in range(_NUM_MODEL_PARAMETERS):
             expected += rows[i, j] * theta[j]
         excess[i] = felt - expected
         expected_square += expected * expected
         excess_square += excess[i] * excess[i]
-    memory[_HELD_FORCE_INDEX] = max(math.sqrt(expected_square), fade * memory[_HELD_FORCE_INDEX])
-    out[THRESHOLD_INDEX] = max(absolute, weber * memory[_HELD_FORCE_INDEX])
-    noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD_INDEX]
+    memory[_MASKING_FORCE] = max(math.sqrt(expected_square), fade * memory[_MASKING_FORCE])
+    out[DETECTION_THRESHOLD_INDEX] = max(absolute, weber * memory[_MASKING_FORCE])
+    noticed = attentive and math.sqrt(excess_square) >= out[DETECTION_THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        _update_expected_force(
-            theta,
-            memory[_COVARIANCE_START:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS),
-            rows,
-            excess,
-            dt,
-        )
+        P = memory[_COVARIANCE_START:].reshape(_NUM_MODEL_PARAMETERS, _NUM_MODEL_PARAMETERS)
+        _update_force_model(theta, P, rows, excess, dt)
 
 
 @njit(cache=True)
-def _update_expected_force(theta, P, rows, excess, dt):
-    gain = np.empty(_NUM_PARAMETERS)
-    for j in range(_NUM_PARAMETERS):
-        P[j, j] += _PARAMETER_DRIFT_STD[j] * _PARAMETER_DRIFT_STD[j] * dt
+def _update_force_model(theta, P, rows, excess, dt):
+    gain = np.empty(_NUM_MODEL_PARAMETERS)
+    for j in range(_NUM_MODEL_PARAMETERS):
+        P[j, j] += _FORCE_MODEL_DRIFT_STD[j] * _FORCE_MODEL_DRIFT_STD[j] * dt
     before = theta.copy()
     for i in range(3):
         residual, variance = excess[i], _FORCE_NOISE_DENSITY * _FORCE_NOISE_DENSITY / dt
-        for j in range(_NUM_PARAMETERS):
+        for j in range(_NUM_MODEL_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0
-            for k in range(_NUM_PARAMETERS):
+            for k in range(_NUM_MODEL_PARAMETERS):
                 gain[j] += P[j, k] * rows[i, k]
             variance += rows[i, j] * gain[j]
-        for j in range(_NUM_PARAMETERS):
+        for j in range(_NUM_MODEL_PARAMETERS):
             theta[j] += gain[j] * residual / variance
-            for k in range(_NUM_PARAMETERS):
+            for k in range(_NUM_MODEL_PARAMETERS):
                 P[j, k] -= gain[j] * gain[k] / variance
 
 

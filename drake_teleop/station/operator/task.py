@@ -17,7 +17,7 @@ class _Task:
     )
 
     @property
-    def distance(self) -> float:
+    def target_distance(self) -> float:
         """Distance from the tool's start to the target [m]."""
         return math.hypot(*self.translation)
 
@@ -31,25 +31,26 @@ class Reach(_Task):
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "required time in the target")
 
 
-@settings
 @dataclass
-class Touch(_Task):
-    """Task: approach a surface at the target, detect contact, and stop."""
-
+class _ContactTask(_Task):
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
     )
+
+
+@settings
+@dataclass
+class Touch(_ContactTask):
+    """Task: approach a surface at the target, detect contact, and stop."""
+
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest after the stop")
 
 
 @settings
 @dataclass
-class Press(_Task):
+class Press(_ContactTask):
     """Task: approach a surface at the target and press on it with a set force."""
 
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
     force: float = quantity(8.0, "N", 0.1, 500.0, "set force of the tool on the surface")
     tolerance: float = quantity(2.0, "N", 0.05, 100.0, "tolerance of the set force")
     hold: float = quantity(1.0, "s", 0.0, 60.0, "duration of the set force")
@@ -57,13 +58,10 @@ class Press(_Task):
 
 @settings
 @dataclass
-class Insert(_Task):
+class Insert(_ContactTask):
     """Task: insert the tool into a slot with its mouth at the target, down to the slot's floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "time after which the operator gives up")
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
     depth: float = quantity(0.04, "m", 1e-3, 0.5, "depth of the slot")
     push: float = quantity(10.0, "N", 0.1, 500.0, "downward force of the tool in the slot")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest on the floor")
@@ -74,7 +72,7 @@ KIND_REACH, KIND_TOUCH, KIND_PRESS, KIND_INSERT = range(4)
 TASK_CLASSES = (Reach, Touch, Press, Insert)
 
 #: Names of the measures that `station.task_measures` defines.
-TASK_MEASURES = (
+TASK_MEASURE_NAMES = (
     "success",
     "task_time_s",
     "contact_force_overshoot_N",
@@ -104,13 +102,13 @@ class Movement:
     gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 
 
-def check_task(task: Task, where: str) -> None:
+def check_distance(task: Task, where: str) -> None:
     """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
-    if task.distance <= least:
+    if task.target_distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m (its "
-            "radius or standoff)",
+            f"the target is {task.target_distance:g} m from the tool's start, not above {least:g}"
+            " m (its radius or standoff)",
             where=f"{where}.translation",
             remedy="choose a target farther from the tool's start",
         )

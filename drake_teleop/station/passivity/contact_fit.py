@@ -10,7 +10,7 @@ from drake_teleop.common.compiled import njit
 NUM_FIT_SUMS = 5  #: number of sums of the fit; all are 0 at the start
 # Relative increase of the squared speed changes: where speed and displacement are proportional, the
 # fit then assigns the force to stiffness.
-_RIDGE_SHARE = 0.05
+_DAMPING_RIDGE_SHARE = 0.05
 
 
 @njit(cache=True)
@@ -26,7 +26,7 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
     sums[2] += speed_change * speed_change
     sums[3] += force_change * displacement
     sums[4] += force_change * speed_change
-    square = (1.0 + _RIDGE_SHARE) * sums[2]
+    square = (1.0 + _DAMPING_RIDGE_SHARE) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
     if not damping > 0.0:  # after this branch the determinant is not 0
@@ -35,7 +35,7 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 
 
 @njit(cache=True)
-def remove_slip_steps(displayed, component, explained, share, max_slip):
+def force_without_slip_steps(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
     `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change

@@ -49,12 +49,12 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
             remedy="give one wrench and one pose per sample",
         )
     work = np.zeros((len(wrench), 2))
-    _accumulate_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
+    _cumulative_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
     return work
 
 
 @njit(cache=True)
-def _accumulate_work_into(wrench, pose, share, work):
+def _cumulative_work_into(wrench, pose, share, work):
     dx, f = np.zeros(6), np.zeros(6)
     for k in range(1, len(wrench)):
         pose_difference_into(pose[k], pose[k - 1], dx)

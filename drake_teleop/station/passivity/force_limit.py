@@ -13,7 +13,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import none
-from drake_teleop.station.passivity.memory import HELD_WRENCH, MOTION_SCALE, own_parameters
+from drake_teleop.station.passivity.memory import LAST_WRENCH, MOTION_SCALE, own_parameters
 from drake_teleop.station.passivity.packet import limit_group
 
 _HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
@@ -36,7 +36,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    HELD_WRENCH,
+    LAST_WRENCH,
     SERVO_D,
     SERVO_K,
     own_memory,
@@ -35,8 +35,8 @@ from drake_teleop.station.passivity.packet import (
 
 # Parameters; pairs are for translation and rotation.
 _layout = own_parameters()
-_SPRING, _DAMPER = _layout.vector(2), _layout.vector(2)
-_SLAVE_FEEDBACK, _HAND_FEEDBACK = _layout.number(), _layout.number()
+_COUPLING_STIFFNESS, _COUPLING_DAMPING = _layout.vector(2), _layout.vector(2)
+_SLAVE_FEEDBACK_GAIN, _HAND_FEEDBACK_GAIN = _layout.number(), _layout.number()
 _POSE_DIFFERENCE = own_memory().vector(6)
 
 
@@ -71,8 +71,8 @@ class FourChannelConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
-        p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
+        p[_COUPLING_STIFFNESS], p[_COUPLING_DAMPING] = self.stiffness, self.damping
+        p[_SLAVE_FEEDBACK_GAIN], p[_HAND_FEEDBACK_GAIN] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
@@ -83,14 +83,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     if connected:
         pose_difference_into(received[POSE], pose, difference)
     for i in range(6):
-        g = i // 3
-        wrench[i] = (1.0 + p[_HAND_FEEDBACK]) * received[WRENCH][i] + p[_HAND_FEEDBACK] * hand[i]
+        g, gain = i // 3, p[_HAND_FEEDBACK_GAIN]
+        wrench[i] = (1.0 + gain) * received[WRENCH][i] + gain * hand[i]
         if connected:
-            wrench[i] += p[_SPRING][g] * difference[i]
-            wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
+            wrench[i] += p[_COUPLING_STIFFNESS][g] * difference[i]
+            wrench[i] += p[_COUPLING_DAMPING][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit_group(wrench, g, limits[g])
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, hand, packet)
 
 
@@ -99,13 +99,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if has_arrived(received):
         shift = memory[_POSE_DIFFERENCE]
         for i in range(6):
-            g = i // 3
-            force = (1.0 + p[_SLAVE_FEEDBACK]) * received[WRENCH][i] + p[_SLAVE_FEEDBACK] * wrench[
-                i
-            ]
+            g, gain = i // 3, p[_SLAVE_FEEDBACK_GAIN]
+            force = (1.0 + gain) * received[WRENCH][i] + gain * wrench[i]
             shift[i] = (force + p[SERVO_D][g] * received[VELOCITY][i]) / p[SERVO_K][g]
         move_pose_into(received[POSE], shift, memory[COMMAND_POSE])
         copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

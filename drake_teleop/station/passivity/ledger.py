@@ -17,25 +17,25 @@ from drake_teleop.station.passivity import ledger_slave
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
     CONTACT_DAMPING,
+    CONTACT_DIRECTION,
     CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
-    DRAG,
+    DRAG_WRENCH,
     ENCODER_STEP,
     IN_CONTACT,
-    INITIAL,
+    INITIAL_ENERGY,
     LEDGER_LEVEL,
-    MASS_FACTOR,
     MASTER_RESERVE,
     MEAN_WRENCH,
     NEWEST_SLAVE_PACKET,
-    NORMAL,
     OWN_VELOCITY,
-    RESERVE_MARGIN,
     ROUND_TRIP,
-    SERVO_MODEL,
-    SHARED_RESERVE,
+    SERVO_MODEL_POSE,
+    SHARED_RESERVE_SHARE,
+    SLAVE_MASS_FACTOR,
     SLAVE_RESERVE,
     TORQUE_PER_FORCE,
+    UNUSED_RESERVE_SHARE,
     WRENCH_METRIC,
     filter_velocity,
     is_in_contact,
@@ -46,7 +46,7 @@ from drake_teleop.station.passivity.ledger_slave import (
 )
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
-    HELD_WRENCH,
+    LAST_WRENCH,
     MOTION_SCALE,
     RECEIVED_ENERGY,
     SENT_ENERGY,
@@ -74,50 +74,51 @@ from drake_teleop.station.passivity.packet import (
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 _VELOCITY_FILTER_S = 4e-3
 _STIFFNESS_MARGIN = 1.1
-_MAX_STIFFNESS, _MIN_STIFFNESS = 2500.0, 50.0  # N/m
+_MAX_WALL_STIFFNESS, _MIN_WALL_STIFFNESS = 2500.0, 50.0  # N/m
 _PREDICTION_LEAD_STEPS = 2.0
-_OFFSET_FADE_S = 0.3
+_ONSET_OFFSET_FADE_S = 0.3
 _FRICTION_MEMORY_S = 1.0
-_FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
-_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS = 0.6, 30.0
-_TORQUE_STIFFNESS_FACTOR, _MAX_CONE = 4.0, 1.0
+_MIN_FRICTION_RELAXATION_S, _SLIP_SPEED = 0.1, 1e-3
+_TORQUE_RELAXATION_S, _TORQUE_RELAXATION_ROUND_TRIPS = 0.6, 30.0
+_ROTATION_FRICTION_STIFFNESS_FACTOR, _MAX_FRICTION_COEFFICIENT = 4.0, 1.0
 _MIN_WRENCH_NORM_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
 _MAX_PREDICTED_RISE_N = 3.0
 _MAX_WALL_FORCE_N = 10.0
-_SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
-_REMOVED_DEPTH_M, _REMOVED_FORCE_N, _REMOVED_MIN_DEPTH_M = 3e-3, 1.0, 1e-3
-_NO_CONTACT_DEPTH_M, _NO_CONTACT_IMPULSE_NS = 0.3e-3, 0.03
-_FORWARDING_LEVEL = 0.5  # of the master's reserve
-_MIN_RESERVE_LEVEL = 0.05  # of the master's reserve
+_SAME_WALL_DISTANCE_M, _SAME_WALL_COSINE = 5e-3, 0.7
+_MAX_REMOVAL_DEPTH_M, _EXPECTED_REMOVAL_FORCE_N, _MIN_REMOVAL_DEPTH_M = 3e-3, 1.0, 1e-3
+_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
+_INPUT_FORWARDING_LEVEL = 0.5  # of the master's reserve
+_UNUSED_RESERVE_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
 _RELEASE_DISTANCE_M = 0.03
 _WRENCH_RECOVERY_S = 1.0
-_HAND_ACCELERATION = 5.0  # m/s^2
+_MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_SPEED = 0.02  # m/s
 _HAND_REST_S = 0.1
-_DRAG_FADE = 0.25
+_DRAG_FADE = 0.25  # of the master's reserve
 _LOST_MOTION_STEPS = 1.1  # of the encoders
-_LOW_LEVEL, _FULL_LEVEL = 1.0 - SHARED_RESERVE, 1.0 - 1e-9  # of a reserve, the latter for rounding
-_BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
+_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - SHARED_RESERVE_SHARE, 1.0 - 1e-9  # of a reserve; rounding
+_BRAKE_FORCE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
-# Memory. The first places are those of `ledger_slave`, up to `NORMAL`.
+# Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
 _layout = own_memory()
-_layout.vector(NORMAL.stop - OWN_VELOCITY.start)
+_layout.vector(CONTACT_DIRECTION.stop - OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
-_OFFSET, _WALL_DIRECTION = _layout.vector(6), _layout.vector(6)
-_WALL_STIFFNESS, _WALL_DEPTH, _LOST_IMPULSE = _layout.number(), _layout.number(), _layout.number()
+_ONSET_OFFSET, _INTO_WALL = _layout.vector(6), _layout.vector(6)
+_WALL_STIFFNESS, _HAND_DEPTH, _MISSING_IMPULSE = (_layout.number() for _ in range(3))
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
-_FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _layout.vector(6), _layout.vector(6)
-_FRICTION_REST, _FRICTION_CONE = _layout.vector(6), _layout.vector(2)
+_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE = _layout.vector(6), _layout.vector(6)
+_FRICTION_RESIDUAL, _FRICTION_COEFFICIENT = _layout.vector(6), _layout.vector(2)
 _RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
-_LAST_SLAVE_POSE, _SLAVE_STEP = _layout.vector(7), _layout.vector(6)
+_LAST_SLAVE_POSE, _SLAVE_DISPLACEMENT = _layout.vector(7), _layout.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
-_WORK_ON_HAND, _WITHHELD_SHARE = _layout.vector(2), _layout.vector(2)
+_WORK_ON_HAND_SINCE_REST, _WITHHELD_SHARE = _layout.vector(2), _layout.vector(2)
 _DRAG_ACTIVE = _layout.vector(2)
 _LOST_MOTION, _STEADY_STEP = _layout.vector(6), _layout.vector(6)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
-_NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _layout.number(), _layout.vector(2), _layout.vector(6)
+_NEWEST_PACKET, _IS_CROSS_FADING = _layout.number(), _layout.vector(2)
+_LAST_UNLIMITED_WRENCH = _layout.vector(6)
 
 
 @settings
@@ -157,12 +158,12 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
+        p[INITIAL_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
             self.hand_reserve,
         )
-        p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
+        p[DRAG_WRENCH] = np.divide(self.drag, p[MOTION_SCALE])
         p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
         p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[MOTION_SCALE])
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
@@ -170,8 +171,8 @@ class LedgerConfig:
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[STORED_ENERGY] = p[INITIAL] / 2.0
-    memory[SERVO_MODEL] = memory[COMMAND_POSE]
+    memory[STORED_ENERGY] = p[INITIAL_ENERGY] / 2.0
+    memory[SERVO_MODEL_POSE] = memory[COMMAND_POSE]
 
 
 def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,8 +180,8 @@ def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
-    left = (1.0 - RESERVE_MARGIN) * np.asarray(config.reserve)
-    return np.sqrt(2.0 * left / (MASS_FACTOR * mass))
+    left = (1.0 - UNUSED_RESERVE_SHARE) * np.asarray(config.reserve)
+    return np.sqrt(2.0 * left / (SLAVE_MASS_FACTOR * mass))
 
 
 @njit(cache=True)
@@ -191,8 +192,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
     filter_velocity(offset_to_slave, min(T / _VELOCITY_FILTER_S, 1.0), memory)
-    memory[_WALL_DEPTH] += work_along(memory[_WALL_DIRECTION], steady)
-    inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_WALL_DEPTH] > 0.0
+    memory[_HAND_DEPTH] += work_along(memory[_INTO_WALL], steady)
+    inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
         receive_energy(g, received, memory)
@@ -206,7 +207,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         wrench[i] += received[PACKET_LOAD_WRENCH][i]
     newest = received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
-        memory[_CROSS_FADING] = 1.0
+        memory[_IS_CROSS_FADING] = 1.0
     memory[_NEWEST_PACKET] = newest
     for g in range(2):
         _cross_fade_wrench(g, T, p, memory, wrench)
@@ -214,7 +215,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[MASTER_RESERVE][g]
         if memory[IN_CONTACT] > 0.0:
-            level += SHARED_RESERVE * p[SLAVE_RESERVE][g]
+            level += SHARED_RESERVE_SHARE * p[SLAVE_RESERVE][g]
         surplus = max(memory[STORED_ENERGY][g] - level, 0.0)
         memory[SENT_ENERGY][g] += surplus
         memory[STORED_ENERGY][g] -= surplus
@@ -224,7 +225,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             memory[SENT_ENERGY][g],
             memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g],
         )
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_MOTION][i]
@@ -247,9 +248,9 @@ def _remove_encoder_flicker(dx, p, memory):
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    work, ledger = dot_of_group(memory[HELD_WRENCH], dx, g), memory[STORED_ENERGY]
-    memory[_WORK_ON_HAND][g] = max(memory[_WORK_ON_HAND][g] + work, 0.0)
-    if work < 0.0 and in_contact and ledger[g] > _FORWARDING_LEVEL * p[MASTER_RESERVE][g]:
+    work, ledger = dot_of_group(memory[LAST_WRENCH], dx, g), memory[STORED_ENERGY]
+    memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
+    if work < 0.0 and in_contact and ledger[g] > _INPUT_FORWARDING_LEVEL * p[MASTER_RESERVE][g]:
         memory[SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
@@ -261,50 +262,50 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_WALL_DIRECTION]
-    k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
+    contact_wrench, normal, inward = received[WRENCH], memory[CONTACT_DIRECTION], memory[_INTO_WALL]
+    k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
     if not is_in_contact(contact_wrench, p):
         if memory[IN_CONTACT] > 0.0:
-            memory[_CROSS_FADING][:] = 1.0
+            memory[_IS_CROSS_FADING][:] = 1.0
         memory[IN_CONTACT] = 0.0
-        removal_depth = _REMOVED_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
-        removal_depth = min(_REMOVED_DEPTH_M, max(removal_depth, _REMOVED_MIN_DEPTH_M))
-        slave_depth = memory[_WALL_DEPTH] - work_along(inward, offset_to_slave)
-        memory[_LOST_IMPULSE] += T * memory[_WALL_STIFFNESS] * (slave_depth - _NO_CONTACT_DEPTH_M)
-        if slave_depth <= _NO_CONTACT_DEPTH_M:
-            memory[_LOST_IMPULSE] = 0.0
+        removal_depth = _EXPECTED_REMOVAL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
+        removal_depth = min(_MAX_REMOVAL_DEPTH_M, max(removal_depth, _MIN_REMOVAL_DEPTH_M))
+        slave_depth = memory[_HAND_DEPTH] - work_along(inward, offset_to_slave)
+        memory[_MISSING_IMPULSE] += T * memory[_WALL_STIFFNESS] * (slave_depth - _IMPULSE_DEPTH_M)
+        if slave_depth <= _IMPULSE_DEPTH_M:
+            memory[_MISSING_IMPULSE] = 0.0
         if memory[_WALL_STIFFNESS] > 0.0 and received[CONTACT_STIFFNESS] == 0.0:
             memory[_WALL_STIFFNESS] = 0.0
-            memory[_CROSS_FADING][:] = memory[_WORK_ON_HAND][:] = 0.0
-        if slave_depth > removal_depth or memory[_LOST_IMPULSE] > _NO_CONTACT_IMPULSE_NS:
+            memory[_IS_CROSS_FADING][:] = memory[_WORK_ON_HAND_SINCE_REST][:] = 0.0
+        if slave_depth > removal_depth or memory[_MISSING_IMPULSE] > _MAX_MISSING_IMPULSE_NS:
             memory[_WALL_STIFFNESS] = 0.0
-        inside = min(memory[_WALL_STIFFNESS] * max(memory[_WALL_DEPTH], 0.0), _MAX_WALL_FORCE_N)
+        inside = min(memory[_WALL_STIFFNESS] * max(memory[_HAND_DEPTH], 0.0), _MAX_WALL_FORCE_N)
         for i in range(6):
             wrench[i] = -inside * inward[i]
         return
-    memory[_LOST_IMPULSE] = 0.0
-    offset, onset = memory[_OFFSET], memory[IN_CONTACT] == 0.0
+    memory[_MISSING_IMPULSE] = 0.0
+    offset, onset = memory[_ONSET_OFFSET], memory[IN_CONTACT] == 0.0
     if onset or not wrench_component_along(contact_wrench, memory[MEAN_WRENCH], p) > 0.0:
-        memory[_CROSS_FADING][:] = 1.0
+        memory[_IS_CROSS_FADING][:] = 1.0
     size = update_contact_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
     damper, speed = received[CONTACT_DAMPING], work_along(normal, received[VELOCITY])
-    depth = max(size + damper * speed, 0.0) / max(k, _MIN_STIFFNESS)
+    depth = max(size + damper * speed, 0.0) / max(k, _MIN_WALL_STIFFNESS)
     depth -= work_along(normal, offset_to_slave)
     if onset:
         aligned = -wrench_component_along(normal, inward, p) > _SAME_WALL_COSINE
         same = memory[_WALL_STIFFNESS] > 0.0 and aligned
-        near = abs(depth - memory[_WALL_DEPTH]) < _SAME_WALL_M
-        if same and (near or memory[_WALL_DEPTH] < 0.0):
+        near = abs(depth - memory[_HAND_DEPTH]) < _SAME_WALL_DISTANCE_M
+        if same and (near or memory[_HAND_DEPTH] < 0.0):
             offset[:] = 0.0
         else:
             copy_into(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
-        memory[_FRICTION_CONE][:] = 0.0
+        memory[_FRICTION_COEFFICIENT][:] = 0.0
         memory[_RETREAT_DISTANCE] = 0.0
-        for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
+        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _FRICTION_RESIDUAL):
             memory[friction] = 0.0
         copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
-    fade = 1.0 - min(T / _OFFSET_FADE_S, 1.0)
+    fade = 1.0 - min(T / _ONSET_OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
         offset_to_slave[i] -= offset[i]
@@ -320,20 +321,20 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         retreat *= 1.0 - min(T / _HAND_REST_S, 1.0)
     memory[_RETREAT_DISTANCE] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _RELEASE_DISTANCE_M), 0.0), 1.0)
-    _update_slave_step(received, memory)
+    _update_slave_displacement(received, memory)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
-    if k > _MIN_STIFFNESS:
-        memory[_WALL_STIFFNESS], memory[_WALL_DEPTH] = k, depth
+    if k > _MIN_WALL_STIFFNESS:
+        memory[_WALL_STIFFNESS], memory[_HAND_DEPTH] = k, depth
         for i in range(6):
             inward[i] = -normal[i]
 
 
 @njit(cache=True)
-def _update_slave_step(received, memory):
+def _update_slave_displacement(received, memory):
     last = memory[_LAST_SLAVE_POSE]
-    pose_difference_into(received[POSE], last, memory[_SLAVE_STEP])
+    pose_difference_into(received[POSE], last, memory[_SLAVE_DISPLACEMENT])
     copy_into(last, 0, received, POSE.start, 7)
 
 
@@ -343,20 +344,20 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 
     It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
     """
-    near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
-    slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
-    normal = memory[NORMAL]
+    near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
+    rest, normal = memory[_FRICTION_RESIDUAL], memory[CONTACT_DIRECTION]
+    slave_step, cone = memory[_SLAVE_DISPLACEMENT], memory[_FRICTION_COEFFICIENT]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
     copy_into(wrench, 0, received, WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
         metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
-        spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
+        spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
-        lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
+        lag = max(cone[g] * size / (_MAX_WALL_STIFFNESS * _SLIP_SPEED), _MIN_FRICTION_RELAXATION_S)
         if g == 1:
-            lag = max(_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS * received[ROUND_TRIP])
+            lag = max(_TORQUE_RELAXATION_S, _TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP])
         share = T / lag
         for i in range(3 * g, 3 * g + 3):
             inward = metric * normal[i]
@@ -378,13 +379,13 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
-    return factor * _MAX_STIFFNESS / max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
+    factor = 1.0 if g == 0 else _ROTATION_FRICTION_STIFFNESS_FACTOR
+    return factor * _MAX_WALL_STIFFNESS / max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 
 
 @njit(cache=True)
 def _remove_normal_component(wrench, p, memory):
-    normal = memory[NORMAL]
+    normal = memory[CONTACT_DIRECTION]
     component = wrench_component_along(wrench, normal, p)
     for i in range(6):
         wrench[i] -= component * normal[i]
@@ -392,7 +393,7 @@ def _remove_normal_component(wrench, p, memory):
 
 @njit(cache=True)
 def _cross_fade_wrench(g, T, p, memory, wrench):
-    last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
+    last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
     size, most = length_of_group(wrench, g), MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
@@ -412,9 +413,9 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         displacement = dot_of_group(wrench, memory[OWN_VELOCITY], g) / size * T
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
-            cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
+            cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
     most = min(T * _DRAIN_RATE, 1.0) * max(
-        memory[STORED_ENERGY][g] - _MIN_RESERVE_LEVEL * p[MASTER_RESERVE][g], 0.0
+        memory[STORED_ENERGY][g] - _UNUSED_RESERVE_LEVEL * p[MASTER_RESERVE][g], 0.0
     )
     share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _WRENCH_RECOVERY_S)
     if share * cost > most:
@@ -427,7 +428,7 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    if memory[STORED_ENERGY][g] >= _MIN_RESERVE_LEVEL * p[MASTER_RESERVE][g]:
+    if memory[STORED_ENERGY][g] >= _UNUSED_RESERVE_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
@@ -437,29 +438,29 @@ def _permitted_braking_share(g, dx, T, p, memory):
 @njit(cache=True)
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
-    speed, master_level = (
+    speed, own_level = (
         length_of_group(velocity, g),
         memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g],
     )
     # Sent energy counts as arrived: its confirmation takes a round trip.
     lowest = min(
-        master_level, (received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
+        own_level, (received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
     )
     in_contact = memory[IN_CONTACT] > 0.0
-    if (in_contact and master_level < _FULL_LEVEL) or (not in_contact and lowest < _LOW_LEVEL):
+    if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):
         active[g] = 1.0
-    elif in_contact or lowest >= _FULL_LEVEL:
+    elif in_contact or lowest >= _DRAG_OFF_LEVEL:
         active[g] = 0.0
     if active[g] > 0.0:
-        drag = p[DRAG][g]
+        drag = p[DRAG_WRENCH][g]
         if in_contact:
-            drag *= min((1.0 - master_level) / _DRAG_FADE, 1.0)
+            drag *= min((1.0 - own_level) / _DRAG_FADE, 1.0)
     if speed < _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g]:
-        memory[_WORK_ON_HAND][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
-    if memory[_WORK_ON_HAND][g] > 0.0:
+        memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
+    if memory[_WORK_ON_HAND_SINCE_REST][g] > 0.0:
         excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_SPEED
         share = excess / (_FULL_BRAKE_SPEED - _NO_BRAKE_SPEED)
-        drag = max(drag, _BRAKE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
+        drag = max(drag, _BRAKE_FORCE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
     drag *= _permitted_braking_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g])

@@ -12,7 +12,7 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.contact_fit import (
     NUM_FIT_SUMS,
     force_change_by_slip,
-    remove_slip_steps,
+    force_without_slip_steps,
     update_contact_fit,
 )
 from drake_teleop.station.passivity.memory import (
@@ -20,7 +20,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     LOAD_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
@@ -37,7 +37,7 @@ from drake_teleop.station.passivity.packet import (
     INTEGRAL,
     PACKET_LOAD_WRENCH,
     POSE,
-    SECOND_ENERGY,
+    SECOND_ENERGY_COUNTER,
     VELOCITY,
     WRENCH,
     credit_new_energy,
@@ -54,63 +54,63 @@ from drake_teleop.station.passivity.packet import (
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 #: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
-RESERVE_MARGIN = 0.03  #: share of the slave's reserve that is never used
-SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
+UNUSED_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
+SHARED_RESERVE_SHARE = 0.7  #: share of the slave's reserve that the master may hold in contact
 _MIN_KEPT_RESERVE_SHARE = 0.05
-_STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
-_ENERGY_CAPACITY = 4.0  # over the reserve
-_SLAVE_FILTER_S = 3e-3
+_SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
+_MAX_ENERGY_IN_RESERVES = 4.0  # over the reserve
+_MEASUREMENT_FILTER_S = 3e-3
 _REST_SPEED = 0.05  # m/s
 _REST_SEND_RATE, _SEND_RATE = 20.0, 50.0  # 1/s
 _MAXIMA_DECAY_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
-_PRESSING_SPEED = 0.06  # m/s
+_HAND_PRESSING_SPEED = 0.06  # m/s
 _STRETCH_M, _FAST_STRETCH_M = 2e-4, 2e-3
 _MIN_FIT_M, _MAX_FIT_M = 1e-3, 1e-2
-_FAST_SPEED = 0.15  # m/s
+_FAST_FIT_SPEED = 0.15  # m/s
 _SHARE_FILTER_S, _SHARE_DEADBAND = 0.02, 0.1
-_REMOVAL_FORCE_N = 0.3
+_MIN_REMOVED_WALL_FORCE_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
-_SLIP_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
-_GAIN_RISE_S, _MIN_GAIN, _MAX_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
-_COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
+_SLIP_FORCE_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
+_GAIN_RISE_S, _MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
+_COMMAND_FILTER_S, _MAX_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
 _MAX_FEEDFORWARD_SILENCE_S = 0.02
-_SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
-_STOP_HORIZON_S = 4e-3
-_FREE_CONTACT_FORCE_N = 5.0
-_STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
+_MAX_SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
+_MOTOR_ENERGY_HORIZON_S = 4e-3
+_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
+_STANDSTILL_SPEED, _MAX_BRAKE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
 CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
-LEDGER_LEVEL = SECOND_ENERGY
+LEDGER_LEVEL = SECOND_ENERGY_COUNTER
 NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _layout = own_parameters()
-INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-DRAG, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
+INITIAL_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
+DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = own_memory()
 OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
-MEAN_WRENCH, NORMAL = _layout.vector(6), _layout.vector(6)
-SERVO_MODEL, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
+MEAN_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
+SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
 _MOTOR_WRENCH = _layout.vector(6)
-_BALANCE, _CONTACT_INPUT = _layout.vector(2), _layout.vector(2)  # A, Q
+_MOTOR_ENERGY, _CONTACT_ENERGY = _layout.vector(2), _layout.vector(2)  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
 _CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
-_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _WALL_DEPTH = (_layout.number() for _ in range(4))
+_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _SLAVE_DEPTH = (_layout.number() for _ in range(4))
 # Fit of k and b: filtered force; force and speed at the start of the stretch; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _STRETCH_FORCE, _STRETCH_SPEED = (_layout.number() for _ in range(3))
-_STRETCH_LENGTH, _FILTER_LAG, _FIT_LENGTH = (_layout.number() for _ in range(3))
+_FILTERED_FORCE, _STRETCH_START_FORCE, _STRETCH_START_SPEED = (_layout.number() for _ in range(3))
+_STRETCH_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_LENGTH = (_layout.number() for _ in range(3))
 _FIT_SUMS = _layout.vector(NUM_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
-_CONTACT_WRENCH, _LOAD = _layout.vector(6), _layout.vector(6)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
+_CONTACT_WRENCH, _FILTERED_LOAD = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
-_DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_layout.number() for _ in range(3))
+_DISPLAYED_FORCE, _LAST_INWARD_SPEED, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
 
 
 @njit(cache=True)
@@ -145,7 +145,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 
     The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
     """
-    mean, normal = memory[MEAN_WRENCH], memory[NORMAL]
+    mean, normal = memory[MEAN_WRENCH], memory[CONTACT_DIRECTION]
     rate = 1.0
     if memory[IN_CONTACT] > 0.0:
         # A wrench far above the mean, which may be noise, replaces it at once.
@@ -175,25 +175,25 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = has_arrived(received)
     memory[_PERIOD] = T
-    memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
-    silence = memory[_SILENCE] if connected else 0.0
+    memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
+    silence = memory[_SILENCE_TIME] if connected else 0.0
     kept = 1.0 - T / _MAXIMA_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
-    filter_velocity(twist, min(T / _SLAVE_FILTER_S, 1.0), memory)
-    contact, load, filtered_load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_LOAD]
+    filter_velocity(twist, min(T / _MEASUREMENT_FILTER_S, 1.0), memory)
+    contact, load, filtered = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_FILTERED_LOAD]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
-    delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)
+    delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)
     share = min(T / delay, 1.0) if memory[STEP_COUNT] > 0.0 else 1.0
     for i in range(6):
-        filtered_load[i] += share * (load[i] - filtered_load[i])
+        filtered[i] += share * (load[i] - filtered[i])
     for g in range(2):
         _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _identify_contact(received, in_contact, dx, contact, T, p, memory)
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         pose_difference_into(received[POSE], now, error)
@@ -202,19 +202,20 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for i in range(6):
         error[i] = T * velocity[i]
     move_pose_into(now, error, now)
-    _limit_motor_energy(now, pose, twist, p, memory)
+    _limit_command_to_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    fill_packet(memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST], contact, packet)
+    fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
-        correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, memory[NORMAL], p)
+        normal = memory[CONTACT_DIRECTION]
+        correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, normal, p)
         for i in range(6):
-            packet[WRENCH][i] += correction * memory[NORMAL][i]
-    copy_into(packet, PACKET_LOAD_WRENCH.start, filtered_load, 0, 6)
+            packet[WRENCH][i] += correction * normal[i]
+    copy_into(packet, PACKET_LOAD_WRENCH.start, filtered, 0, 6)
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
-        size = length_of_group(memory[NORMAL], g)
-        compliance += size * size / (_STIFFNESS_FACTOR * p[SERVO_K][g])
+        size = length_of_group(memory[CONTACT_DIRECTION], g)
+        compliance += size * size / (_SERVO_STIFFNESS_FACTOR * p[SERVO_K][g])
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
         packet[LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
     packet[CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
@@ -225,32 +226,37 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
-    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[HELD_WRENCH], dx, g))
+    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_WRENCH], dx, g))
     new = receive_energy(g, received, memory)
     ledger, input_energy, reserve = (
         memory[STORED_ENERGY],
-        memory[_CONTACT_INPUT],
+        memory[_CONTACT_ENERGY],
         p[SLAVE_RESERVE][g],
     )
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length_of_group(twist, g)
-    kinetic = 0.5 * MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
+    kinetic = 0.5 * SLAVE_MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
     free, missing, returned = ledger[g] - kinetic, hold - _master_level(g, received, memory), 0.0
     needed = missing
     if in_contact and speed < _REST_SPEED * ANGLE_PER_LENGTH[g]:
-        keep, rate = (1.0 - SHARED_RESERVE) * reserve, _REST_SEND_RATE
-        needed += SHARED_RESERVE * reserve
+        keep, rate = (1.0 - SHARED_RESERVE_SHARE) * reserve, _REST_SEND_RATE
+        needed += SHARED_RESERVE_SHARE * reserve
         returned = min(free - _MIN_KEPT_RESERVE_SHARE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
-    lost = max(ledger[g] - returned - _ENERGY_CAPACITY * reserve, 0.0)
+    lost = max(ledger[g] - returned - _MAX_ENERGY_IN_RESERVES * reserve, 0.0)
     memory[SENT_ENERGY][g] += returned
     memory[DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
-    memory[_BALANCE][g] = ledger[g] - kinetic
+    memory[_MOTOR_ENERGY][g] = ledger[g] - kinetic
+
+
+@njit(cache=True)
+def _servo_lag_s(p):
+    return 2.0 * math.sqrt(p[SLAVE_MASS][0] / p[SERVO_K][0])
 
 
 @njit(cache=True)
@@ -260,14 +266,9 @@ def _master_level(g, received, memory):
 
 
 @njit(cache=True)
-def _servo_lag(p):
-    return 2.0 * math.sqrt(p[SLAVE_MASS][0] / p[SERVO_K][0])
-
-
-@njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    normal, fill_level = memory[NORMAL], 0.0
-    depth, base = _PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
+    normal, fill_level = memory[CONTACT_DIRECTION], 0.0
+    depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
     for g in range(2):
         travel, reserve = (
             ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth,
@@ -277,16 +278,16 @@ def _max_displayed_stiffness(received, T, p, memory):
         level = min(max(_master_level(g, received, memory) / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
-        _MAX_FEEDFORWARD_SILENCE_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
+        _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
     )
     max_silence = min(max_silence, _MAX_SILENCE_S)
-    goal = _MAX_GAIN * fill_level - 1.0
+    goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
         goal = min(goal, 0.0)
     if memory[IN_CONTACT] == 0.0:
         memory[_EXTRA_GAIN] = 0.0
     else:
-        change = max(goal, _MIN_GAIN - 1.0) - memory[_EXTRA_GAIN]
+        change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_EXTRA_GAIN]
         memory[_EXTRA_GAIN] += T / (_GAIN_RISE_S if change > 0.0 else _GAIN_FALL_S) * change
     gain = 1.0 + memory[_EXTRA_GAIN]
     least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
@@ -295,46 +296,47 @@ def _max_displayed_stiffness(received, T, p, memory):
 
 @njit(cache=True)
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
-    normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
+    normal, velocity = memory[CONTACT_DIRECTION], memory[OWN_VELOCITY]
+    k = memory[_CONTACT_STIFFNESS]
     if not in_contact:
         if memory[IN_CONTACT] > 0.0 and _is_wall_removed(dx, memory):
             memory[_DISPLAYED_SHARE] = 0.0
-        memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION] = 0.0
+        memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
-    max_slip = _max_slip_change(wrench, size, T, p, memory)
-    inward, rate = -work_along(normal, dx), min(T / _SLAVE_FILTER_S, 1.0)
+    max_slip = _max_slip_force_change(wrench, size, T, p, memory)
+    inward, rate = -work_along(normal, dx), min(T / _MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
         # Start at the first sample in contact, because the step to it was partly outside.
-        memory[_FILTERED_FORCE] = memory[_STRETCH_FORCE] = memory[_DISPLAYED_FORCE] = size
-        memory[_FILTER_LAG] = inward
-        memory[_STRETCH_SPEED] = memory[_LAST_SPEED] = speed
+        memory[_FILTERED_FORCE] = memory[_STRETCH_START_FORCE] = memory[_DISPLAYED_FORCE] = size
+        memory[_DISPLACEMENT_FILTER_LAG] = inward
+        memory[_STRETCH_START_SPEED] = memory[_LAST_INWARD_SPEED] = speed
         memory[_STRETCH_LENGTH] = memory[_FIT_LENGTH] = 0.0
         memory[_DISPLAYED_SHARE] = memory[_SHARE_GOAL] = k_d / max(k, k_d)
-    filtered_step = rate * (inward - memory[_FILTER_LAG])
-    memory[_FILTER_LAG] += filtered_step - inward
+    filtered_step = rate * (inward - memory[_DISPLACEMENT_FILTER_LAG])
+    memory[_DISPLACEMENT_FILTER_LAG] += filtered_step - inward
     memory[_STRETCH_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
     fastest = math.hypot(
         length_of_group(velocity, 0), length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
     )
-    slow, length_m = fastest < _FAST_SPEED, abs(memory[_STRETCH_LENGTH])
+    slow, length_m = fastest < _FAST_FIT_SPEED, abs(memory[_STRETCH_LENGTH])
     if length_m > (_STRETCH_M if slow else _FAST_STRETCH_M):
         memory[_FIT_LENGTH] = min(memory[_FIT_LENGTH] + length_m, _MAX_FIT_M)
         keep = max(1.0 - length_m / max(memory[_FIT_LENGTH], _MIN_FIT_M), 0.0) if slow else 0.5
-        speed_change = speed - memory[_STRETCH_SPEED]
+        speed_change = speed - memory[_STRETCH_START_SPEED]
         stretch, damping = memory[_STRETCH_LENGTH], memory[_CONTACT_DAMPING]
-        change = memory[_FILTERED_FORCE] - memory[_STRETCH_FORCE] - damping * speed_change
+        change = memory[_FILTERED_FORCE] - memory[_STRETCH_START_FORCE] - damping * speed_change
         change -= force_change_by_slip(
             change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip
         )
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
-        memory[_STRETCH_LENGTH], memory[_STRETCH_FORCE] = 0.0, memory[_FILTERED_FORCE]
-        memory[_STRETCH_SPEED] = speed
+        memory[_STRETCH_LENGTH], memory[_STRETCH_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
+        memory[_STRETCH_START_SPEED] = speed
     if k > 1.0:  # N/m
         rate, goal = min(T / _SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
         if abs(goal - memory[_SHARE_GOAL]) > _SHARE_DEADBAND * memory[_SHARE_GOAL]:
@@ -342,59 +344,59 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         memory[_DISPLAYED_SHARE] += rate * (memory[_SHARE_GOAL] - memory[_DISPLAYED_SHARE])
         depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
         if memory[IN_CONTACT] == 0.0:
-            memory[_WALL_DEPTH] = depth
-        memory[_WALL_DEPTH] += inward + rate * (depth - memory[_WALL_DEPTH] - inward)
+            memory[_SLAVE_DEPTH] = depth
+        memory[_SLAVE_DEPTH] += inward + rate * (depth - memory[_SLAVE_DEPTH] - inward)
         memory[IN_CONTACT] = 1.0
     explained = memory[_CONTACT_STIFFNESS] * inward
-    explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED])
-    rate = T / _SLIP_FADE_S + abs(inward) / _MIN_FIT_M
-    shown = remove_slip_steps(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
+    explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_INWARD_SPEED])
+    rate = T / _SLIP_FORCE_FADE_S + abs(inward) / _MIN_FIT_M
+    shown = force_without_slip_steps(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
     memory[_DISPLAYED_FORCE] = shown
-    memory[_LAST_SPEED] = speed
+    memory[_LAST_INWARD_SPEED] = speed
 
 
 @njit(cache=True)
 def _is_wall_removed(dx, memory):
-    normal = memory[NORMAL]
-    speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_SPEED]
+    normal = memory[CONTACT_DIRECTION]
+    speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_INWARD_SPEED]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
     explained += abs(memory[_CONTACT_DAMPING] * speed_change)
-    return memory[_DISPLAYED_FORCE] > max(_REMOVAL_FORCE_N, 2.0 * explained)
+    return memory[_DISPLAYED_FORCE] > max(_MIN_REMOVED_WALL_FORCE_N, 2.0 * explained)
 
 
 @njit(cache=True)
-def _max_slip_change(wrench, size, T, p, memory):
+def _max_slip_force_change(wrench, size, T, p, memory):
     mean_wrench = memory[MEAN_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - size * size, 0.0))
-    largest = max(memory[_MAX_FRICTION] * (1.0 - min(T / _FRICTION_MEMORY_S, 1.0)), friction)
-    memory[_MAX_FRICTION] = largest
+    largest = max(memory[_MAX_FRICTION_FORCE] * (1.0 - min(T / _FRICTION_MEMORY_S, 1.0)), friction)
+    memory[_MAX_FRICTION_FORCE] = largest
     return largest * min(largest / mean, 1.0)
 
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    velocity, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
+    velocity, normal, feed = memory[COMMAND_TWIST], memory[CONTACT_DIRECTION], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
-        beyond_wall = memory[_WALL_DEPTH] - work_along(normal, error)
+        beyond_wall = memory[_SLAVE_DEPTH] - work_along(normal, error)
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
             compliance, inward_speed = 1.0 - memory[_DISPLAYED_SHARE], -work_along(normal, feed)
-    feeds_forward = connected and memory[_SILENCE] < _MAX_FEEDFORWARD_SILENCE_S
+    feeds_forward = connected and memory[_SILENCE_TIME] < _MAX_FEEDFORWARD_SILENCE_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
         distance, acceleration = length_of_group(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
         rate = 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
-            rate = min(rate, _BRAKING_FACTOR * math.sqrt(2.0 * acceleration / distance))
+            rate = min(rate, _STOPPING_SPEED_FACTOR * math.sqrt(2.0 * acceleration / distance))
         for i in range(3 * g, 3 * g + 3):
             error[i] *= rate
             if feeds_forward:
                 error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
-        available = max(memory[STORED_ENERGY][g] - RESERVE_MARGIN * p[SLAVE_RESERVE][g], 0.0)
-        limit_group(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[SLAVE_MASS][g])))
+        available = max(memory[STORED_ENERGY][g] - UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], 0.0)
+        limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * p[SLAVE_MASS][g])))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
         limit_group(error, g, acceleration * T)
@@ -403,12 +405,12 @@ def _generate_command(received, connected, T, p, memory, error):
 
 
 @njit(cache=True)
-def _limit_motor_energy(command, pose, twist, p, memory):
+def _limit_command_to_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) so that the motors' energy suffices; return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
-        K, D = _STIFFNESS_FACTOR * p[SERVO_K][g], _DAMPING_FACTOR * p[SERVO_D][g]
+        K, D = _SERVO_STIFFNESS_FACTOR * p[SERVO_K][g], _SERVO_DAMPING_FACTOR * p[SERVO_D][g]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
         if _limit_motor_wrench(g, D, twist, p, memory):
@@ -434,32 +436,33 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     size, speed, mass = (
         length_of_group(motor_wrench, g),
         length_of_group(twist, g),
-        MASS_FACTOR * p[SLAVE_MASS][g],
+        SLAVE_MASS_FACTOR * p[SLAVE_MASS][g],
     )
     stands = length_of_group(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
-    margin, balance, changed = RESERVE_MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
+    margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_MOTOR_ENERGY][g]
+    changed = False
     pushes = (
         dot_of_group(motor_wrench, twist, g) > 0.0 or dot_of_group(motor_wrench, velocity, g) > 0.0
     )
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free, k = (
-            _FREE_CONTACT_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
+            _FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
             memory[_CONTACT_STIFFNESS],
         )
         spring = (1.0 + memory[_EXTRA_GAIN]) * free * free / (2.0 * max(k, 1.0))
-        available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_CONTACT_INPUT][g])
+        available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_CONTACT_ENERGY][g])
         if stands or not pushes:
             # Delayed motors gain a little energy at standstill; with an empty balance they yield.
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
-        permitted += mass * speed / _STOP_HORIZON_S  # stops without a rebound
-    reach = _STOP_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+        permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
+    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True
     if balance < margin and not stands:
-        strongest = mass * _DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
+        strongest = mass * _MAX_BRAKE_DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
         brake = min(damping * speed, strongest)
         if -brake * speed < dot_of_group(motor_wrench, twist, g):
             for i in range(3 * g, 3 * g + 3):
@@ -470,7 +473,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
 
 @njit(cache=True)
 def _step_servo_model(received, connected, T, p, memory, error):
-    model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
+    model, velocity = memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:
         pose_difference_into(received[POSE], model, error)
@@ -486,6 +489,6 @@ def _step_servo_model(received, connected, T, p, memory, error):
 def record_command(requested, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != requested[i]:
-            if _limit_motor_energy(command, pose, twist, p, memory):
+            if _limit_command_to_motor_energy(command, pose, twist, p, memory):
                 copy_into(memory, COMMAND_POSE.start, command, 0, 7)
             return

@@ -36,7 +36,7 @@ STORED_ENERGY = _layout.vector(2)  #: energy that this end may still release, by
 RECEIVED_ENERGY = _layout.vector(2)  #: energy from the other end that is credited here [J]
 SENT_ENERGY = _layout.vector(2)  #: this end's counter of sent energy [J]
 DISSIPATED_ENERGY = _layout.vector(2)  #: energy that the method removed from the loop here [J]
-HELD_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
+LAST_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
 LOAD_WRENCH = _layout.vector(6)  #: part of the slave's wrench from its load's weight and inertia
 COMMAND = _layout.vector(13)  #: slave's command since the last step: pose X_WS, twist
 #: Remaining time in which the slave keeps its command while a new channel fills [s].
@@ -60,7 +60,7 @@ SLAVE_MASS = _parameter_layout.vector(2)
 MOTION_SCALE = _parameter_layout.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
 #: [m/s, rad/s].
-MAX_RETREAT = _parameter_layout.vector(2)
+RETREAT_SPEED = _parameter_layout.vector(2)
 _METHOD_PARAMETERS = _parameter_layout.rest()
 
 

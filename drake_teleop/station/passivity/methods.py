@@ -46,10 +46,10 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     LAST_PACKET,
-    MAX_RETREAT,
     MEMORY_SIZE,
     MOTION_SCALE,
     NUM_PARAMETERS,
+    RETREAT_SPEED,
     SERVO_D,
     SERVO_K,
     SLAVE_MASS,
@@ -64,7 +64,7 @@ from drake_teleop.station.passivity.packet import (
     is_vector_finite,
 )
 from drake_teleop.station.passivity.pspm import PspmConfig
-from drake_teleop.station.passivity.safe_state import limit_retreat_of_hand
+from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
 from drake_teleop.station.passivity.tdpa import TdpaConfig, charged_tdpa_config
 from drake_teleop.station.passivity.two_layer import TwoLayerConfig
 from drake_teleop.station.passivity.wave import WaveConfig
@@ -257,7 +257,7 @@ def method_parameters(
     p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
     p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
-    p[MAX_RETREAT] = (
+    p[RETREAT_SPEED] = (
         np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
     )
     own = config.method_config()
@@ -282,36 +282,36 @@ def initial_method_memory(
     return memory
 
 
-_VECTOR_TYPE = types.Array(types.float64, 1, "C")
-_MASTER_ARGUMENTS = (
-    _VECTOR_TYPE,
+_NUMBA_VECTOR = types.Array(types.float64, 1, "C")
+_MASTER_ARGUMENT_TYPES = (
+    _NUMBA_VECTOR,
     types.boolean,
-    *[_VECTOR_TYPE] * 5,
+    *[_NUMBA_VECTOR] * 5,
     types.float64,
-    *[_VECTOR_TYPE] * 4,
+    *[_NUMBA_VECTOR] * 4,
 )
-_SLAVE_ARGUMENTS = (
-    _VECTOR_TYPE,
+_SLAVE_ARGUMENT_TYPES = (
+    _NUMBA_VECTOR,
     types.boolean,
-    *[_VECTOR_TYPE] * 4,
+    *[_NUMBA_VECTOR] * 4,
     types.float64,
-    *[_VECTOR_TYPE] * 4,
+    *[_NUMBA_VECTOR] * 4,
 )
-_RECORD_ARGUMENTS = (_VECTOR_TYPE,) * 6
-_master_step, _slave_step, _record_command = map(
-    make_call_at_address, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
+_RECORD_ARGUMENT_TYPES = (_NUMBA_VECTOR,) * 6
+_call_master_step, _call_slave_step, _call_record_command = map(
+    make_call_at_address, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES)
 )
 
 
-def steps_of(method: str) -> tuple[int, int, int]:
+def step_addresses(method: str) -> tuple[int, int, int]:
     """Return the addresses of a method's compiled functions: master, slave, record."""
-    return _addresses_of_functions(*METHODS[method][:3])
+    return _addresses_of_steps(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
+def _addresses_of_steps(*steps: Any) -> tuple[int, int, int]:
     master, slave, sent = zip(
-        steps, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS), strict=True
+        steps, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES), strict=True
     )
     return address_of_function(*master), address_of_function(*slave), address_of_function(*sent)
 
@@ -358,10 +358,10 @@ def master_step(
     if not healthy:
         wrench[:] = 0.0
     else:
-        _master_step(
+        _call_master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
-        limit_retreat_of_hand(twist, T, p, memory, wrench)
+        fade_retreat_wrench(twist, T, p, memory, wrench)
     _complete_packet(healthy, memory, packet)
 
 
@@ -389,7 +389,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         memory[COMMAND_TWIST] = 0.0
         copy_into(command, 0, memory, COMMAND.start, 13)
     else:
-        _slave_step(
+        _call_slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
     _complete_packet(healthy, memory, packet)
@@ -402,4 +402,4 @@ def record_command(steps, requested, command, pose, twist, p, memory):
     `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
     the method may change.
     """
-    _record_command(steps[2], requested, command, pose, twist, p, memory)
+    _call_record_command(steps[2], requested, command, pose, twist, p, memory)

@@ -34,7 +34,7 @@ INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
 ENERGY = _layout.vector(2)
 #: Second energy counter, by group [J].
-SECOND_ENERGY = _layout.vector(2)
+SECOND_ENERGY_COUNTER = _layout.vector(2)
 #: 1 while the slave's detector reports contact.
 CONTACT_FLAG = _layout.number()
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last

@@ -18,7 +18,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
@@ -43,10 +43,10 @@ from drake_teleop.station.passivity.packet import (
 # Parameters, for translation and rotation.
 _layout = own_parameters()
 _INITIAL_ENERGY, _MAX_ENERGY = _layout.vector(2), _layout.vector(2)
-_SPRING, _DAMPER = _layout.vector(2), _layout.vector(2)
+_SPRING_STIFFNESS, _HAND_DAMPING = _layout.vector(2), _layout.vector(2)
 # Memory: set position minus actual position; requested value of this offset.
 _layout = own_memory()
-_OFFSET, _REQUESTED = _layout.vector(6), _layout.vector(6)
+_SPRING_DEFLECTION, _REQUESTED_DEFLECTION = _layout.vector(6), _layout.vector(6)
 
 
 @settings
@@ -71,7 +71,7 @@ class PspmConfig:
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
         p[_INITIAL_ENERGY], p[_MAX_ENERGY] = self.initial, self.ceiling
-        p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
+        p[_SPRING_STIFFNESS], p[_HAND_DAMPING] = self.stiffness, self.damping
 
 
 @njit(cache=True)
@@ -81,9 +81,9 @@ def initialize(p, memory):
 
 @njit(cache=True)
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    offset, requested = memory[_OFFSET], memory[_REQUESTED]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
-    damped = -dot_of_group(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
+    damped = -dot_of_group(memory[LAST_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
     ledger = memory[STORED_ENERGY]
     energy = ledger[g] + damped
     energy += credit_new_energy(g, received, memory)
@@ -103,8 +103,8 @@ def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memor
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
-    K, B = p[_SPRING], p[_DAMPER]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
+    received_wrench, K, B = received[WRENCH], p[_SPRING_STIFFNESS], p[_HAND_DAMPING]
     for g in range(2):
         before = dot_of_group(offset, offset, g)
         for i in range(3 * g, 3 * g + 3):
@@ -117,14 +117,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit_group(wrench, g, limits[g])
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    offset, requested = memory[_OFFSET], memory[_REQUESTED]
-    now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
+    now, held, K, D = memory[COMMAND_POSE], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
@@ -142,7 +142,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
+    offset, other, held = memory[_SPRING_DEFLECTION], np.empty(6), memory[LAST_WRENCH]
     K, D = p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, offset)
     pose_difference_into(requested, pose, other)

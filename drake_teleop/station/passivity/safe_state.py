@@ -13,8 +13,8 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     HAND_VELOCITY,
-    HELD_WRENCH,
-    MAX_RETREAT,
+    LAST_WRENCH,
+    RETREAT_SPEED,
     SLAVE_MASS,
     SlotAllocator,
 )
@@ -33,12 +33,12 @@ _HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _layout = SlotAllocator(MASTER_MONITOR_SIZE)
-SILENCE_S = _layout.number()  #: time without packets [s], also at the slave
-_PRESENT_LIMITS = _layout.vector(2)  # present limits
+SILENCE_TIME = _layout.number()  #: time without packets [s], also at the slave
+_PRESENT_WRENCH_LIMITS = _layout.vector(2)  # present limits
 _LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
 _CONNECTED_TIME = _layout.number()  # time since the last silence
 # Monitor state of the slave.
-_layout = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_S + 1)
+_layout = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
 _STOPPING_TIME = _layout.number()  # time since it began to stop
 _RESUMING_TIME = _layout.number()  # time since it began to resume
 _STOP_POSE = _layout.vector(7)  # command when it began to stop
@@ -53,16 +53,16 @@ def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[n
     """
     watch = np.zeros(MASTER_MONITOR_SIZE)
     if full is None:
-        watch[SILENCE_S] = np.inf
+        watch[SILENCE_TIME] = np.inf
     else:
-        watch[_PRESENT_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
+        watch[_PRESENT_WRENCH_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
     return watch
 
 
 def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
-    watch[SILENCE_S] = np.inf
+    watch[SILENCE_TIME] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
         watch[part] = pose
     return watch
@@ -71,9 +71,9 @@ def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 @njit(cache=True)
 def _update_silence_time(alive, fault, T, watch):
     if fault:
-        watch[SILENCE_S] = np.inf
+        watch[SILENCE_TIME] = np.inf
     else:
-        watch[SILENCE_S] = 0.0 if alive else watch[SILENCE_S] + T
+        watch[SILENCE_TIME] = 0.0 if alive else watch[SILENCE_TIME] + T
 
 
 @njit(cache=True)
@@ -86,9 +86,9 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     updated.
     """
     _update_silence_time(alive, fault, T, watch)
-    connected = watch[SILENCE_S] <= timeout
+    connected = watch[SILENCE_TIME] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
-    present, fall = watch[_PRESENT_LIMITS], watch[_LIMIT_FALL_RATE]
+    present, fall = watch[_PRESENT_WRENCH_LIMITS], watch[_LIMIT_FALL_RATE]
     for g in range(2):
         size, limit = length_of_group(held, g), present[g]
         if connected:
@@ -114,7 +114,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
     start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
     step = np.empty(6)
-    if watch[SILENCE_S] <= timeout:
+    if watch[SILENCE_TIME] <= timeout:
         watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME_S)
     elif watch[_RESUMING_TIME] > 0.0:
         pose_difference_into(last, before, velocity)
@@ -143,10 +143,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 
 @njit(cache=True)
-def limit_retreat_of_hand(twist, T, p, memory, wrench):
+def fade_retreat_wrench(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
-    It falls to 0 for hand speeds along the wrench between `MAX_RETREAT` and twice this.
+    It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):
@@ -156,6 +156,6 @@ def limit_retreat_of_hand(twist, T, p, memory, wrench):
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
-            share = max(2.0 - along / p[MAX_RETREAT][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
+            share = max(2.0 - along / p[RETREAT_SPEED][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)

@@ -19,7 +19,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     MOTION_SCALE,
     RECEIVED_ENERGY,
     SENT_ENERGY,
@@ -36,7 +36,7 @@ from drake_teleop.station.passivity.packet import (
     MAX_WRENCH_RATE,
     PACKET_NUMBER,
     POSE,
-    SECOND_ENERGY,
+    SECOND_ENERGY_COUNTER,
     WRENCH,
     credit_new_energy,
     dot_of_group,
@@ -61,12 +61,12 @@ _STIFFNESS_TRAVEL = (1e-3, 1e-2)
 _FULL_DRAG_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET, _SLAVE_LEDGER = INTEGRAL.start, SECOND_ENERGY
+_NEWEST_MASTER_PACKET, _SLAVE_STORED_ENERGY = INTEGRAL.start, SECOND_ENERGY_COUNTER
 
-# Parameters.
+# Parameters; reserve, drag and stiffness in the master's power units.
 _layout = own_parameters()
-_RELEASE, _DRAIN, _DRIFT_RATE = _layout.number(), _layout.number(), _layout.number()
-_RESERVE, _DRAG, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))  # in power units
+_RELEASE_TIME, _DRAIN_RATE, _DRIFT_RATE = _layout.number(), _layout.number(), _layout.number()
+_TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
 _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _layout = own_memory()
@@ -74,8 +74,8 @@ _WITHHELD_SHARE, _RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _layout = own_memory()
-_INPUT, _OUTPUT = _layout.vector(2), _layout.vector(2)
-_COMMAND_INPUT, _COMMAND_OUTPUT = _layout.vector(2), _layout.vector(2)
+_WORK_IN, _WORK_OUT = _layout.vector(2), _layout.vector(2)
+_COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _WITHHELD_COMMAND, _FILTERED_WRENCH = _layout.vector(6), _layout.vector(6)
 _STIFFNESS_ESTIMATE, _ONSET_PACKET = _layout.vector(2), _layout.vector(2)
 _LAST_COMMAND = _layout.vector(7)  # the command of the last step
@@ -125,10 +125,10 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
-        p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
+        p[_RELEASE_TIME], p[_DRAIN_RATE] = self.release, self.drain_rate
+        p[_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
+        p[_TARGET_RESERVE], p[_DRAG_WRENCH] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
-        p[_MAX_COMMAND_SPEED] = self.speed
 
 
 def charged_tdpa_config() -> TdpaConfig:
@@ -140,7 +140,8 @@ def charged_tdpa_config() -> TdpaConfig:
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     for g in range(2):
         memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
-    drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
+    drain = min(T * p[_DRAIN_RATE], 1.0)
+    release = T / p[_RELEASE_TIME] if p[_RELEASE_TIME] > 0.0 else 1.0
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
@@ -156,17 +157,17 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
             share = _permitted_wrench_share(
-                g, drained, drain, stored, share, T, p, memory[HELD_WRENCH], wrench
+                g, drained, drain, stored, share, T, p, memory[LAST_WRENCH], wrench
             )
         withheld[g] = 1.0 - share
         memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         scale_group(wrench, g, share)
-        _add_drag_force(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
+        _add_drag_force(g, received[_SLAVE_STORED_ENERGY][g], dx, limits, T, p, memory, wrench)
         _balance_hand_work(g, dot_of_group(wrench, dx, g), p, memory)
-        if p[_DRAG][g] > 0.0:
+        if p[_DRAG_WRENCH][g] > 0.0:
             _send_surplus_energy(g, p, memory)
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
 
@@ -183,8 +184,8 @@ def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench
 
 @njit(cache=True)
 def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    drag, level = p[_DRAG][g], memory[STORED_ENERGY][g] + memory[_RESERVED_ENERGY][g]
-    if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
+    drag, level = p[_DRAG_WRENCH][g], memory[STORED_ENERGY][g] + memory[_RESERVED_ENERGY][g]
+    if drag > 0.0 and min(level, slave_ledger) < p[_TARGET_RESERVE][g]:
         damping = drag / max(length_of_group(dx, g), _FULL_DRAG_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
@@ -194,7 +195,7 @@ def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
 @njit(cache=True)
 def _send_surplus_energy(g, p, memory):
     ledger = memory[STORED_ENERGY]
-    surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
+    surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_TARGET_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
     ledger[g] -= surplus
     memory[SENT_ENERGY][g] += surplus
@@ -207,7 +208,7 @@ def _balance_hand_work(g, drained, p, memory):
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
-        more = min(-_RESERVED_INPUT_SHARE * drained, max(p[_RESERVE][g] - kept[g], 0.0))
+        more = min(-_RESERVED_INPUT_SHARE * drained, max(p[_TARGET_RESERVE][g] - kept[g], 0.0))
         memory[SENT_ENERGY][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -219,21 +220,21 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot_of_group(wrench, dx, g)
-        memory[_INPUT][g] += max(work, 0.0)
-        memory[_OUTPUT][g] += max(-work, 0.0)
+        memory[_WORK_IN][g] += max(work, 0.0)
+        memory[_WORK_OUT][g] += max(-work, 0.0)
     if has_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
         available = _energy_available_to_slave(memory, g)
-        credit = min(memory[_INPUT][g], memory[_COMMAND_INPUT][g]) + min(available, 0.0)
+        credit = min(memory[_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
         # Output beyond the received energy is compensated before energy is sent.
         memory[SENT_ENERGY][g] = max(memory[SENT_ENERGY][g], credit)
         memory[STORED_ENERGY][g] = available
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[_SLAVE_LEDGER][g] = memory[STORED_ENERGY][g]
+        packet[_SLAVE_STORED_ENERGY][g] = memory[STORED_ENERGY][g]
         _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, memory[_FILTERED_WRENCH], packet)
 
 
@@ -266,7 +267,7 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
 def _estimate_contact_stiffness(g, dx, wrench, T, memory):
     size, stiffness = length_of_group(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
-        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[HELD_WRENCH], dx, g)
+        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[LAST_WRENCH], dx, g)
         forget = min(size / _STIFFNESS_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
@@ -274,7 +275,7 @@ def _estimate_contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _energy_available_to_slave(memory, g):
-    return memory[RECEIVED_ENERGY][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
+    return memory[RECEIVED_ENERGY][g] - max(memory[_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g])
 
 
 @njit(cache=True)
@@ -295,8 +296,8 @@ def _advance_command(received, wrench, T, p, memory):
             scale_group(step, g, available / pressing)
             memory[DISSIPATED_ENERGY][g] += pressing - available
             pressing = available
-        memory[_COMMAND_OUTPUT][g] += max(pressing, 0.0)
-        memory[_COMMAND_INPUT][g] += max(-pressing, 0.0)
+        memory[_COMMAND_WORK_OUT][g] += max(pressing, 0.0)
+        memory[_COMMAND_WORK_IN][g] += max(-pressing, 0.0)
     move_pose_into(now, step, now)
     pose_difference_into(received[POSE], now, withheld)
     for i in range(6):
@@ -308,10 +309,10 @@ def _add_command_work(command, sign, memory):
     step = np.empty(6)
     pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
-        work = sign * dot_of_group(memory[HELD_WRENCH], step, g)
+        work = sign * dot_of_group(memory[LAST_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
-        memory[_COMMAND_INPUT][g] += into
-        memory[_COMMAND_OUTPUT][g] += into - work
+        memory[_COMMAND_WORK_IN][g] += into
+        memory[_COMMAND_WORK_OUT][g] += into - work
 
 
 @njit(cache=True)

@@ -17,7 +17,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
@@ -46,11 +46,11 @@ from drake_teleop.station.passivity.packet import (
 _layout = own_parameters()
 _SEND_RATE, _DRAIN_RATE = _layout.number(), _layout.number()
 _INITIAL_ENERGY, _FILL_LEVEL, _CAPACITY = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-_DAMPER, MAX_ACCELERATION = _layout.vector(2), _layout.vector(2)
+_FILL_DAMPING, MAX_ACCELERATION = _layout.vector(2), _layout.vector(2)
 _TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _layout = own_memory()
-_SPRING_WRENCH, _BRAKE_WRENCH = _layout.vector(6), _layout.vector(6)
+_SPRING_WRENCH, _DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
 
 
 @settings
@@ -83,7 +83,7 @@ class TwoLayerConfig:
     def pack_into(self, p: NDArray[np.float64]) -> None:
         p[_SEND_RATE], p[_DRAIN_RATE] = self.send_rate, self.drain_rate
         p[_INITIAL_ENERGY], p[_FILL_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
-        p[_DAMPER], p[MAX_ACCELERATION] = self.damper, self.acceleration
+        p[_FILL_DAMPING], p[MAX_ACCELERATION] = self.damper, self.acceleration
 
 
 @njit(cache=True)
@@ -94,7 +94,7 @@ def initialize(p, memory):
 @njit(cache=True)
 def _exchange_energy(received, dx, T, p, memory, packet):
     ledger, sent_so_far = memory[STORED_ENERGY], memory[SENT_ENERGY]
-    held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
+    held, capacity = memory[LAST_WRENCH], p[_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += credit_new_energy(g, received, memory)
@@ -124,7 +124,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     _exchange_energy(received, dx, T, p, memory, packet)
     ledger, requested = memory[STORED_ENERGY], received[WRENCH]
     for g in range(2):
-        damping = p[_DAMPER][g] * max(p[_FILL_LEVEL][g] - ledger[g], 0.0)
+        damping = p[_FILL_DAMPING][g] * max(p[_FILL_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
         limit_group(wrench, g, limits[g])
@@ -133,19 +133,19 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if drained > drainable:
             scale_group(wrench, g, drainable / drained)
         _limit_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
+    spring, brake = memory[_SPRING_WRENCH], memory[_DAMPER_WRENCH]
     _exchange_energy(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
     if has_arrived(received):
         target = received[POSE]
     pose_difference_into(target, pose, spring)
-    motor_wrench, K, D = memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
+    motor_wrench, K, D = memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             spring[i] *= K[g]
@@ -175,7 +175,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
+    spring, held, K, D = memory[_SPRING_WRENCH], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

@@ -20,7 +20,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    HELD_WRENCH,
+    LAST_WRENCH,
     MOTION_SCALE,
     RECEIVED_ENERGY,
     SENT_ENERGY,
@@ -46,14 +46,14 @@ from drake_teleop.station.passivity.packet import (
 # Parameters.
 _layout = own_parameters()
 WAVE_IMPEDANCE = _layout.vector(2)
-_FILTER_TIME, _DAMPER_SHARE = _layout.number(), _layout.number()
+_FILTER_TIME, _MATCHING_DAMPER_SHARE = _layout.number(), _layout.number()
 _MAX_SILENCE, _DRIFT_RATE = _layout.number(), _layout.number()
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
 _layout = own_memory()
-_PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _layout.vector(6), _layout.vector(6), _layout.vector(6)
-_SILENCE, _DRIFT = _layout.number(), _layout.vector(6)
+_OUTPUT_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _OUTPUT_WAVE = (_layout.vector(6) for _ in range(3))
+_SILENCE_TIME, _POSE_DRIFT = _layout.number(), _layout.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
-_CATCHING_UP, _NEWEST_PACKET = _layout.number(), _layout.number()
+_IS_CATCHING_UP, _NEWEST_PACKET = _layout.number(), _layout.number()
 
 
 @settings
@@ -87,13 +87,13 @@ class WaveConfig:
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
         p[WAVE_IMPEDANCE], p[_FILTER_TIME] = self.impedance, self.filter
-        p[_DAMPER_SHARE], p[_MAX_SILENCE] = self.matching, self.patience
+        p[_MATCHING_DAMPER_SHARE], p[_MAX_SILENCE] = self.matching, self.patience
         p[_DRIFT_RATE] = self.drift_rate
 
 
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory, wave):
-    ledger, played = memory[STORED_ENERGY], memory[_PLAYED_INTEGRAL]
+    ledger, played = memory[STORED_ENERGY], memory[_OUTPUT_WAVE_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
         ledger[g] += credit_new_energy(g, received, memory)
@@ -111,12 +111,12 @@ def _filter_received_wave(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
+    wave, integral, sent = memory[_OUTPUT_WAVE], memory[_SENT_WAVE_INTEGRAL], packet[INTEGRAL]
     _filter_received_wave(received, T, p, memory, wave)
-    catching_up, newest = memory[_CATCHING_UP], received[PACKET_NUMBER]
+    catching_up, newest = memory[_IS_CATCHING_UP], received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
         catching_up = 1.0
-    memory[_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
+    memory[_IS_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
     for g in range(2):
         b = p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
@@ -128,14 +128,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
             most = MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
-            if _limit_wrench_change(g, energy, dx, most, memory[HELD_WRENCH], wrench):
-                memory[_CATCHING_UP] = 1.0
+            if _limit_wrench_change(g, energy, dx, most, memory[LAST_WRENCH], wrench):
+                memory[_IS_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[SENT_ENERGY][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -158,12 +158,12 @@ def _limit_wrench_change(g, energy, dx, most, held, wrench):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
-    memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
+    memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     if memory[CHANNEL_FILL_TIME] > 0.0:
         memory[CHANNEL_FILL_TIME] -= T
         step[:] = 0.0
-        _reflect_wave_while_filling(received, wrench, T, p, memory)
-    elif memory[_SILENCE] <= p[_MAX_SILENCE]:
+        _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
+    elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE]:
         _reflect_wave(received, wrench, T, p, memory)
         if has_arrived(received):
             _correct_pose_drift(received, wrench, T, p, memory)
@@ -172,20 +172,20 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             step[i] /= T
     else:
         step[:] = 0.0
-        _reflect_wave_at_rest(wrench, T, p, memory)
-    copy_into(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
+        _reflect_wave_at_held_command(wrench, T, p, memory)
+    copy_into(packet, INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
     copy_into(packet, ENERGY.start, memory, SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def _reflect_wave(received, wrench, T, p, memory):
-    wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_SENT_INTEGRAL]
+    wave, step, integral = memory[_OUTPUT_WAVE], memory[COMMAND_TWIST], memory[_SENT_WAVE_INTEGRAL]
     _filter_received_wave(received, T, p, memory, wave)
     for g in range(2):
-        b, damper = p[WAVE_IMPEDANCE][g], p[_DAMPER_SHARE] * p[WAVE_IMPEDANCE][g]
+        b, damper = p[WAVE_IMPEDANCE][g], p[_MATCHING_DAMPER_SHARE] * p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
             integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
@@ -196,9 +196,9 @@ def _reflect_wave(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _reflect_wave_at_rest(wrench, T, p, memory):
-    wave, ledger = memory[_WAVE], memory[STORED_ENERGY]
-    played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
+def _reflect_wave_at_held_command(wrench, T, p, memory):
+    wave, ledger = memory[_OUTPUT_WAVE], memory[STORED_ENERGY]
+    played, integral = memory[_OUTPUT_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
@@ -212,9 +212,9 @@ def _reflect_wave_at_rest(wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _reflect_wave_while_filling(received, wrench, T, p, memory):
-    wave, ledger, accounted = memory[_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
-    played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
+def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
+    wave, ledger, accounted = memory[_OUTPUT_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
+    played, integral = memory[_OUTPUT_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
         accounted[g] = max(accounted[g], received[ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
@@ -227,7 +227,7 @@ def _reflect_wave_while_filling(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _correct_pose_drift(received, wrench, T, p, memory):
-    drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
+    drift, step = memory[_POSE_DRIFT], memory[COMMAND_TWIST]
     pose_difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):
         if dot_of_group(wrench, drift, g) >= 0.0:

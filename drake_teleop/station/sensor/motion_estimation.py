@@ -49,29 +49,29 @@ from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, GRAVITY_COLUMN, sen
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
-_RMS_LEVER_M = 0.4
+_RMS_LEVER_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
 # accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAITS = 0, 1, 2, 3
+_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAIT_SAMPLES = 0, 1, 2, 3
 _ACCELEROMETER_POSITION = 6  # (3,)
 _ACCELEROMETER_AXES = _ACCELEROMETER_POSITION + 3  # (3, 3)
 _ANGLE_LOW_PASSES = _ACCELEROMETER_AXES + 9  # (4, 5) the sensor's and those of `encoders`
-_NUM_FILTER_SECTIONS = 4
-_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_FILTER_SECTIONS
+_NUM_ANGLE_SECTIONS = 4
+_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_ANGLE_SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_FLAG_SAMPLES_LEFT = 1
+_FLAGGED_SAMPLES_LEFT = 1
 _ANGULAR_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FUSION_FILTER_SIZE
-_KINEMATICS_SCRATCH = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_START = _KINEMATICS_SCRATCH + FRAME_STATE_SIZE
-_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_FILTER_SECTIONS
+_KINEMATICS_SCRATCH_START = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
+_JOINT_START = _KINEMATICS_SCRATCH_START + FRAME_STATE_SIZE
+_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
 @settings
@@ -97,35 +97,21 @@ class MotionEstimationConfig:
 class PathDelays:
     """Delays of the signal paths at low frequencies [s].
 
-    `sample` is the delay of the slowest path in use, for which the others wait.
+    `sample_s` is the delay of the slowest path in use, for which the others wait.
     """
 
-    wrench: float
-    acceleration: float
-    encoders: float
-    sample: float
+    wrench_s: float
+    acceleration_s: float
+    encoders_s: float
+    sample_s: float
 
 
-@dataclass(frozen=True)
-class SteadyStateFilter:
-    """Steady-state Kalman filter of position, rate and error of a measured acceleration.
-
-    Attributes:
-        gains: (3,) gains of the innovation for position [1], rate [1/s], acceleration [1/s^2].
-        innovation_std, position_std: standard deviations, in the position's unit.
-        crossover_hz: the accelerometer dominates above this frequency, the positions below it.
-    """
-
-    gains: NDArray[np.float64]
-    innovation_std: float
-    position_std: float
-    crossover_hz: float
-
-
-def steady_state_kalman_filter(
+def steady_state_kalman_gains(
     position_std: float, acceleration_std: float, drift: float, period: float
-) -> SteadyStateFilter:
-    """Return the Kalman filter for a measured position x and acceleration a with a drifting error.
+) -> NDArray[np.float64]:
+    """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
+
+    The Kalman filter has a measured position x, and an acceleration a with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -147,35 +133,30 @@ def steady_state_kalman_filter(
     d = -delta / z
     third = np.prod(delta).real
     second = third + keeps * (d[0] * d[1] + d[0] * d[2] + d[1] * d[2]).real
-    return SteadyStateFilter(
-        gains=np.array([1.0 - keeps, second / period, third / period**2]),
-        innovation_std=float(position_std / np.sqrt(keeps)),
-        position_std=float(position_std * np.sqrt(1.0 - keeps)),
-        crossover_hz=float(np.cbrt(np.prod(np.abs(delta)))) / (2 * np.pi * period),
-    )
+    return np.array([1.0 - keeps, second / period, third / period**2])
 
 
 def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
-    wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _group_delay_samples(_low_pass_filters_of_paths(config, sensor, period)) * period
+    wrench, acceleration, encoders = sensor.reading_delays(period)
+    encoders += _group_delay_samples(_angle_low_pass_sections(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
     return PathDelays(float(wrench), float(acceleration), float(encoders), float(sample))
 
 
-def fusion_filters(
+def fusion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[SteadyStateFilter, SteadyStateFilter]:
-    """Return the Kalman filters of source `fused` for angles [rad] and displacements [m]."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
-        steady_state_kalman_filter(angle_std, alpha_std.mean(), drift, period),
-        steady_state_kalman_filter(
-            angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period
+        steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
+        steady_state_kalman_gains(
+            angle_std * _RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
         ),
     )
 
@@ -190,14 +171,14 @@ def estimated_motion_std(
     shift = np.exp(-1j * np.pi * (np.arange(1 << 14) + 0.5) / (1 << 14))
     response = [
         np.polyval([b2, b1, b0], shift) / np.polyval([a2, a1, 1.0], shift)
-        for b0, b1, b2, a1, a2 in _low_pass_filters_of_paths(config, sensor, period)
+        for b0, b1, b2, a1, a2 in _angle_low_pass_sections(config, sensor, period)
     ]
     differenced = np.polyval([-1.0, 4.0, -5.0, 2.0], shift) / period**2
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _encoder_angle_std(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _RMS_LEVER_M, 0.0, alpha], 3)
+    return np.repeat([alpha * _RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
 
 
 def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
@@ -211,25 +192,25 @@ def _accelerometer_std(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
-    p_SoAo_S, R_SA = sensor.accelerometer()
+    p_SoAo_S, R_SA = sensor.accelerometer_pose()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
     x, y, z = p_SoAo_S**2
     crossed = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]]) @ alpha_std**2
     return np.sqrt(s_std**2 + crossed), alpha_std
 
 
-def motion_estimator(
+def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
-    paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
+    paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
     used = np.array([True, config.source != "encoders", True])
-    waits = np.where(used, delays.sample - paths, 0.0) / period
+    waits = np.where(used, delays.sample_s - paths, 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
-    p_SoAo_S, R_SA = sensor.accelerometer()
-    angular, linear = fusion_filters(config, sensor, num_joints, period)
+    p_SoAo_S, R_SA = sensor.accelerometer_pose()
+    angular, linear = fusion_gains(config, sensor, num_joints, period)
     constants = np.concatenate(
         [
             # An ideal accelerometer needs no correction.
@@ -237,9 +218,9 @@ def motion_estimator(
             waits,
             p_SoAo_S,
             R_SA.ravel(),
-            _low_pass_filters_of_paths(config, sensor, period).ravel(),
-            angular.gains,
-            linear.gains,
+            _angle_low_pass_sections(config, sensor, period).ravel(),
+            angular,
+            linear,
         ]
     )
     rows = int(np.ceil(waits.max())) + 1
@@ -248,10 +229,10 @@ def motion_estimator(
     )
 
 
-def _low_pass_filters_of_paths(
+def _angle_low_pass_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    filters = np.zeros((_NUM_FILTER_SECTIONS, 5))
+    filters = np.zeros((_NUM_ANGLE_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
         filters[:2] = butterworth_sections(sensor.bandwidth_hz, 1 / period)
@@ -277,12 +258,12 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     """Convert one reading of the sensor per period to a sample whose values have the same instant.
 
     Args:
-        constants, memory: results of `motion_estimator`; memory is updated.
+        constants, memory: results of `initialize_motion_estimator`; memory is updated.
         reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
     joints = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n]
     angles = sample[SAMPLE_JOINT_POSITION]
     _align_signal_paths(constants, memory, n, reading, sample)
@@ -305,7 +286,7 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
     _align_signal_paths(constants, memory, n, reading, sample)
     copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
@@ -320,12 +301,7 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    _delay_signal_paths(constants, memory, n, reading, sample)
-
-
-@njit(cache=True)
-def _delay_signal_paths(constants, memory, n, reading, sample):
-    angles, width = sample[SAMPLE_JOINT_POSITION], 12 + n
+    width = 12 + n
     line = memory[_JOINT_START + _NUM_VALUES_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
@@ -336,21 +312,21 @@ def _delay_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
-    wrench = int(constants[_PATH_WAITS]) * width
-    acceleration = int(constants[_PATH_WAITS + 1]) * width
+    wrench = int(constants[_PATH_WAIT_SAMPLES]) * width
+    acceleration = int(constants[_PATH_WAIT_SAMPLES + 1]) * width
     waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_PATH_WAITS + 2])
-    older = constants[_PATH_WAITS + 2] - wait
+    wait = int(constants[_PATH_WAIT_SAMPLES + 2])
+    older = constants[_PATH_WAIT_SAMPLES + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES_LEFT] - 1.0
-    memory[_FLAG_SAMPLES_LEFT] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES_LEFT] > 0.0 else 0.0
+    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT] - 1.0
+    memory[_FLAGGED_SAMPLES_LEFT] = max(flagged, 0.0)
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -366,31 +342,24 @@ def _differentiate_joint_angles(constants, joints, angles):
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    period, fused, starts = (
-        constants[_PERIOD_INDEX],
-        constants[_USE_FUSION_INDEX] != 0.0,
-        memory[0] == 0.0,
-    )
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    period = constants[_PERIOD_INDEX]
+    fused = constants[_USE_FUSION_INDEX] != 0.0
+    starts = memory[0] == 0.0
+    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     R_SA, R = matrix_at(constants, _ACCELEROMETER_AXES), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     for i in range(3):
         omega[i] = motion[3 + i]
 
-    angular, linear = (
-        memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START],
-        memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH],
-    )
+    angular = memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START]
+    linear = memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH_START]
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)
             copy_into(angular, 15, R, 0, 9)
-        _rotation_vector_into(angular[15:], R, motion)
+        _rotation_between_into(angular[15:], R, motion)
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
@@ -422,7 +391,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
 
 @njit(cache=True)
-def _rotation_vector_into(before, R, angle):
+def _rotation_between_into(before, R, angle):
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0

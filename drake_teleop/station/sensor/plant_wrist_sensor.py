@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from pydrake.systems.primitives import RandomSource
+from scipy.sparse.csgraph import connected_components
 
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
@@ -55,17 +56,17 @@ from drake_teleop.load.regressor import (
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_with_gyroscope_into,
-    motion_estimator,
+    initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     LOST_FLAG_SAMPLES,
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
-    is_plausible,
+    are_values_plausible,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
 )
 
 Array = NDArray[np.float64]
@@ -74,24 +75,18 @@ _NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
 _DEFAULT_PERIOD_S = 1e-3
 #: Tolerance of whole multiples of the plant's time step, in steps.
-_STEP_TOLERANCE = 1e-6
+_STEP_RATIO_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
-_POSITION, _ORIENTATION, _JOINT_ORIENTATION, _JOINT_POSITION, _GRAVITY, _WRENCH_SIGN = (
-    0,
-    3,
-    12,
-    21,
-    24,
-    27,
-)
+_SENSOR_POSITION, _SENSOR_ORIENTATION = 0, 3
+_WELD_ORIENTATION, _WELD_POSITION, _GRAVITY, _WRENCH_SIGN = 12, 21, 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
 
 
 class _SensorWeld(NamedTuple):
-    reaction: int
-    body: int
+    reaction_index: int
+    body_index: int
     geometry: Array
 
 
@@ -136,7 +131,7 @@ def AddWristSensor(
         builder.Connect(source, sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
         noise = RandomSource(
-            RandomDistribution.kGaussian, NOISE_SIZE, SAMPLES_PER_NOISE_BLOCK * sensor.period
+            RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, SAMPLES_PER_NOISE_BLOCK * sensor.period
         )
         builder.AddNamedSystem(f"{name}_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
@@ -157,7 +152,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         - body_spatial_velocities
         - body_spatial_accelerations
         - reaction_forces
-        - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
+        - noise: (NOISE_BLOCK_SIZE,) standard normal numbers (not if the sensor is ideal)
         output_ports:
         - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
@@ -180,17 +175,19 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         model_instance: ModelInstanceIndex | None = None,
     ) -> None:
         super().__init__()
-        S, joint = _frame_and_weld(plant, joint_or_frame)
+        S, joint = _sensor_frame_and_weld(plant, joint_or_frame)
         self._weld = _weld_properties(plant, S, joint)
         step = plant.time_step() or None
-        self._step_s, self._steps_per_sample = _event_period_and_count(step, period)
+        self._step_s, self._steps_per_sample = _event_period_and_ratio(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
         config.check(_NAME_IN_ERRORS, 1 / self.period)
 
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
-        constants, chain = sensor_chain_constants(config, 3 + n, self.period)
-        motion, estimator = motion_estimator(MotionEstimationConfig(), config, 3 + n, self.period)
+        constants, chain = initialize_sensor_chain(config, 3 + n, self.period)
+        motion, estimator = initialize_motion_estimator(
+            MotionEstimationConfig(), config, 3 + n, self.period
+        )
         sample = np.zeros(sample_size(n) + 1)
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
         held = np.full(_BODY_MOTION_SIZE + n, np.nan)
@@ -198,7 +195,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
         self._sensor = (constants, motion, ends[2] - ends[1], config.ideal)
         self._filters = slice(ends[1], None)
-        self._no_noise = np.zeros(NOISE_SIZE)
+        self._no_noise = np.zeros(NOISE_BLOCK_SIZE)
 
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
         self._poses, self._velocities, self._accelerations, self._reactions = (
@@ -210,12 +207,12 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
                 ("reaction_forces", SpatialForce),
             )
         )
-        noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_SIZE)
+        noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self._noise = noise
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._hold_configuration)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_configuration)
         first = 0
         for name, size in {**signals_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
@@ -241,7 +238,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _hold_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _store_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.get_mutable_value(0)[self._held] = self._evaluate_configuration(context)
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -249,7 +246,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         held = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._hold_configuration(context, discrete_state)
+            self._store_configuration(context, discrete_state)
         if step % self._steps_per_sample == 0:
             configuration = held if self._pairs_steps else self._evaluate_configuration(context)
             memory = discrete_state.get_mutable_value(0)
@@ -272,20 +269,16 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
     alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
-    r = apply_matrix(R_WB, vector_at(geometry, _POSITION))
+    r = apply_matrix(R_WB, vector_at(geometry, _SENSOR_POSITION))
     a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
-    R_SB, R_BW = transposed(matrix_at(geometry, _ORIENTATION)), transposed(R_WB)
+    R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION)), transposed(R_WB)
     s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY))))
-    omega, alpha = (
-        apply_matrix(R_SB, apply_matrix(R_BW, omega)),
-        apply_matrix(R_SB, apply_matrix(R_BW, alpha)),
-    )
-    R_SJc = matrix_at(geometry, _JOINT_ORIENTATION)
-    f, tau = (
-        apply_matrix(R_SJc, vector_at(reaction, 3)),
-        apply_matrix(R_SJc, vector_at(reaction, 0)),
-    )
-    tau = plus(tau, cross(vector_at(geometry, _JOINT_POSITION), f))
+    omega = apply_matrix(R_SB, apply_matrix(R_BW, omega))
+    alpha = apply_matrix(R_SB, apply_matrix(R_BW, alpha))
+    R_SJc = matrix_at(geometry, _WELD_ORIENTATION)
+    f = apply_matrix(R_SJc, vector_at(reaction, 3))
+    tau = apply_matrix(R_SJc, vector_at(reaction, 0))
+    tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION), f))
     for i in range(3):
         truth[SAMPLE_WRENCH.start + i] = geometry[_WRENCH_SIGN] * f[i]
         truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_WRENCH_SIGN] * tau[i]
@@ -300,7 +293,7 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
 def _measure_sample_into(sensor, truth, noise, memory, sample):
     constants, motion_constants, end, ideal = sensor
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    if not is_plausible(constants, truth):  # keeps it out of the filters
+    if not are_values_plausible(constants, truth):  # keeps it out of the filters
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
@@ -334,7 +327,7 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
         )
 
 
-def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
+def _event_period_and_ratio(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
             f"a sampling period of {period} s is not positive and finite",
@@ -344,7 +337,7 @@ def _event_period_and_count(step: float | None, period: float | None) -> tuple[f
     if step is None:
         return period or _DEFAULT_PERIOD_S, 1
     count = (period or step) / step
-    if count < 1 - _STEP_TOLERANCE or abs(count - round(count)) > _STEP_TOLERANCE:
+    if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
         raise DrakeTeleopError(
             f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s",
             where=f"{_NAME_IN_ERRORS}: period",
@@ -353,7 +346,7 @@ def _event_period_and_count(step: float | None, period: float | None) -> tuple[f
     return step, round(count)
 
 
-def _frame_and_weld(
+def _sensor_frame_and_weld(
     plant: MultibodyPlant, joint_or_frame: Joint | Frame
 ) -> tuple[Frame, WeldJoint]:
     expect_type((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
@@ -363,11 +356,11 @@ def _frame_and_weld(
             where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )
-    welds = [joint for joint in _joints_of_model(plant) if isinstance(joint, WeldJoint)]
+    welds = [joint for joint in _joints_of_plant(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
         body = S.body().index()
-        beyond = [joint for joint in welds if _arm_and_load(plant, joint)[0] == body]
+        beyond = [joint for joint in welds if _arm_body_and_load(plant, joint)[0] == body]
         if len(beyond) != 1:
             names = ", ".join(f"'{joint.name()}'" for joint in beyond)
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
@@ -384,42 +377,32 @@ def _frame_and_weld(
             remedy="weld the tool to the arm and pass this WeldJoint",
         )
     parent = joint_or_frame.frame_on_parent()
-    arm, _ = _arm_and_load(plant, joint_or_frame)
+    arm, _ = _arm_body_and_load(plant, joint_or_frame)
     on_parent = parent.body().index() == arm
     return parent if on_parent else joint_or_frame.frame_on_child(), joint_or_frame
 
 
-def _joints_of_model(plant: MultibodyPlant) -> list[Joint]:
+def _joints_of_plant(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
 
 
-def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    neighbours: dict[BodyIndex, list[BodyIndex]] = {}
-    for joint in _joints_of_model(plant):
-        if joint.index() != weld.index():
-            parent, child = joint.parent_body().index(), joint.child_body().index()
-            neighbours.setdefault(parent, []).append(child)
-            neighbours.setdefault(child, []).append(parent)
-    parent, child = weld.parent_body().index(), weld.child_body().index()
-    load = _connected_bodies(neighbours, child)
-    if plant.world_body().index() in load:
-        return child, _connected_bodies(neighbours, parent)
-    return parent, load
-
-
-def _connected_bodies(
-    neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex
-) -> set[BodyIndex]:
-    found, ahead = {start}, [start]
-    while ahead:
-        new = set(neighbours.get(ahead.pop(), ())) - found
-        found |= new
-        ahead += new
-    return found
+def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
+    ends = [
+        (int(joint.parent_body().index()), int(joint.child_body().index()))
+        for joint in _joints_of_plant(plant)
+        if joint.index() != weld.index()
+    ]
+    linked = np.zeros((plant.num_bodies(), plant.num_bodies()))
+    linked[tuple(np.reshape(ends, (-1, 2)).astype(int).T)] = 1.0
+    _, group = connected_components(linked, directed=False)
+    arm, load = weld.parent_body().index(), weld.child_body().index()
+    if group[int(load)] == group[int(plant.world_body().index())]:
+        arm, load = load, arm
+    return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
 def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
-    arm, load = _arm_and_load(plant, joint)
+    arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         raise DrakeTeleopError(
             f"the tool beyond joint '{joint.name()}' has no mass",

@@ -22,9 +22,7 @@ _ATI_IMU_SETTINGS: dict[str, Any] = {
 _BOTA_SETTINGS: dict[str, Any] = {"acceleration_latency": 0.0}
 
 # Ranges of fx and fy, fz, tx and ty, tz; noise of force and torque; resolution; other fields.
-_SETTINGS_OF_SENSOR: dict[
-    str, tuple[float, float, float, float, float, float, float, dict[str, Any]]
-] = {
+_SETTINGS: dict[str, tuple[Any, ...]] = {
     "ati_mini45": (290.0, 580.0, 10.0, 10.0, 0.06, 1.5e-3, 4.3e-4, {}),
     "bota_sensone": (
         *(500.0, 1200.0, 15.0, 12.0, 0.15, 3e-3, 1e-5),
@@ -75,16 +73,7 @@ PRESETS: dict[str, WristSensorConfig] = {
             | {"force_noise": force, "torque_noise": torque, "resolution": step}
             | others
         )
-        for name, (
-            side,
-            along,
-            bending,
-            twist,
-            force,
-            torque,
-            step,
-            others,
-        ) in _SETTINGS_OF_SENSOR.items()
+        for name, (side, along, bending, twist, force, torque, step, others) in _SETTINGS.items()
     },
 }
 """Sensors by name, with the sources of their values.

@@ -42,7 +42,7 @@ from drake_teleop.load.regressor import (
 SAMPLES_PER_NOISE_BLOCK = 128
 _NUM_CHANNELS = 12
 #: Standard normal numbers of a block: 12 for each sample, then 12 for the random walks.
-NOISE_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
+NOISE_BLOCK_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
 LOST_FLAG_SAMPLES = 40
@@ -163,16 +163,10 @@ class WristSensorConfig:
 
     def ranges(self) -> NDArray[np.float64]:
         """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
-        return np.concatenate(
-            [
-                self.force_range,
-                self.torque_range,
-                np.full(3, self.acceleration_range),
-                np.full(3, self.angular_acceleration_range),
-            ]
-        )
+        motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
+        return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
-    def largest_wrench(self) -> NDArray[np.float64]:
+    def largest_plausible_wrench(self) -> NDArray[np.float64]:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
@@ -188,20 +182,20 @@ class WristSensorConfig:
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
-    def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def accelerometer_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return position p_SoAo_S (3,) [m] and axes R_SA (3, 3) of the accelerometer."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
 
-    def latencies(self, period: float) -> NDArray[np.int64]:
+    def latency_samples(self, period: float) -> NDArray[np.int64]:
         """Return the latencies (3,) of wrench, acceleration and encoders, in whole samples."""
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
-    def delays(self, period: float) -> NDArray[np.float64]:
+    def reading_delays(self, period: float) -> NDArray[np.float64]:
         """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
-        delays = self.latencies(period) * np.float64(period)
+        delays = self.latency_samples(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
             for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
                 lag = (b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)
@@ -231,7 +225,7 @@ _CALIBRATION_FIELDS = (
     *("gain_error", "cross_talk", "misalignment"),
     *("acceleration_gain_error", "acceleration_misalignment"),
 )
-_QUANTITY_NAMES = ("force", "torque", "acceleration", "angular_acceleration")
+_NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
@@ -240,8 +234,8 @@ PARTS: dict[str, dict[str, Any]] = {
         "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     },
     "low_pass": {"low_pass": "none"},
-    "noise": {f"{name}_noise": 0.0 for name in _QUANTITY_NAMES},
-    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITY_NAMES},
+    "noise": {f"{name}_noise": 0.0 for name in _NOISY_QUANTITIES},
+    "random_walk": {f"{name}_walk": 0.0 for name in _NOISY_QUANTITIES},
     "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
     "drift": {"drift": [0.0] * 6},
     "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},
@@ -267,13 +261,8 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
         damping = 2 * np.cos(angle) * warped
         a0 = 1 + damping + warped**2
-        sections[row] = (
-            warped**2 / a0,
-            2 * warped**2 / a0,
-            warped**2 / a0,
-            2 * (warped**2 - 1) / a0,
-            (1 - damping + warped**2) / a0,
-        )
+        b0, a1, a2 = warped**2, 2 * (warped**2 - 1), 1 - damping + warped**2
+        sections[row] = np.array([b0, 2 * b0, b0, a1, a2]) / a0
     return sections
 
 
@@ -293,12 +282,12 @@ def calibration_matrices(
     wrench = config.cross_talk * talk * ranges[:, None] / ranges
     np.fill_diagonal(wrench, 1 + config.gain_error * gains)
     scales = 1 + config.acceleration_gain_error * acceleration_gains
-    turned = _rotation_matrix(acceleration_axis, config.acceleration_misalignment)
-    both = np.kron(np.eye(2), _rotation_matrix(axis, config.misalignment))
+    turned = _rotation_about_axis(acceleration_axis, config.acceleration_misalignment)
+    both = np.kron(np.eye(2), _rotation_about_axis(axis, config.misalignment))
     return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
 
 
-def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
@@ -317,20 +306,20 @@ _MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s
 _ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
 _LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
 _LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
-_PATH_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER_STEP = _PATH_LATENCIES + 3
-_IS_IDEAL = _ENCODER_STEP + 1
+_PATH_LATENCY_SAMPLES = _LOW_PASS_STAGE + 1  # (3,)
+_ENCODER_QUANTUM = _PATH_LATENCY_SAMPLES + 3
+_IS_IDEAL = _ENCODER_QUANTUM + 1
 _OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
-_BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
+_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
 _RANDOM_WALK_START = 1
 FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_CHANNELS
 _DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
-_DELAY_LINE_ROW = _NUM_CHANNELS + 2
+_DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 
-def sensor_chain_constants(
+def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
@@ -338,12 +327,12 @@ def sensor_chain_constants(
     `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
-    p_SoAo_S, R_SA = config.accelerometer()
+    p_SoAo_S, R_SA = config.accelerometer_pose()
     limits = config.ranges() if config.saturates else np.full(_NUM_CHANNELS, np.inf)
     sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
-    latencies = config.latencies(period)
+    latencies = config.latency_samples(period)
     constants = np.concatenate(
         [
             config.offset,
@@ -369,11 +358,11 @@ def sensor_chain_constants(
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW + num_joints))
+    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
 
 
 @njit(cache=True)
-def is_plausible(constants, truth):
+def are_values_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
@@ -388,8 +377,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     """Convert true values to the sensor's reading at one instant, once per period.
 
     Args:
-        constants, memory: results of `sensor_chain_constants`; memory is updated.
-        noise: (NOISE_SIZE,) standard normal numbers for this block of samples.
+        constants, memory: results of `initialize_sensor_chain`; memory is updated.
+        noise: (NOISE_BLOCK_SIZE,) standard normal numbers for this block of samples.
         truth: (15 + n,) [wrench (6) of the sensor on the tool at So in S | specific force of So
             (3), angular velocity (3), angular acceleration (3) in S | joint angles (n)].
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
@@ -404,46 +393,44 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    width = _DELAY_LINE_ROW + angles.shape[0]
+    width = _DELAY_LINE_ROW_SIZE + angles.shape[0]
     rows = (memory.shape[0] - _DELAY_LINE_START) // width
     shift_delay_line(memory[_DELAY_LINE_START:], width)
     row = memory[_DELAY_LINE_START:][:width]
     channels = row[:_NUM_CHANNELS]
-    walks, filtered = (
-        memory[_RANDOM_WALK_START:FILTER_MEMORY_START],
-        memory[FILTER_MEMORY_START:_DELAY_LINE_START],
-    )
+    walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
+    filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
     sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         for i in range(_NUM_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
 
     _apply_calibration_errors(constants, truth, channels)
-    if place == _BEFORE_NOISE:
+    if place == _LOW_PASS_BEFORE_NOISE:
         if count == 0:
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
-    if place == _AFTER_CONVERTER and count == 0:
+    if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
-    row[_NUM_CHANNELS] = _quantize(constants, 0, 6, channels)
-    row[_NUM_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
-    if place == _AFTER_CONVERTER:
+    row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
+    row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
+    if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER_STEP]
-    for i in range(_DELAY_LINE_ROW, width):
-        angle = angles[i - _DELAY_LINE_ROW]
+    quantum = constants[_ENCODER_QUANTUM]
+    for i in range(_DELAY_LINE_ROW_SIZE, width):
+        angle = angles[i - _DELAY_LINE_ROW_SIZE]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
 
     if count == 0:
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_PATH_LATENCIES:_ENCODER_STEP]
+    late = constants[_PATH_LATENCY_SAMPLES:_ENCODER_QUANTUM]
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -454,8 +441,8 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     reading[READ_SATURATED] = max(
         memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
     )
-    for i in range(_DELAY_LINE_ROW, width):
-        turned[i - _DELAY_LINE_ROW] = memory[encoders + i]
+    for i in range(_DELAY_LINE_ROW_SIZE, width):
+        turned[i - _DELAY_LINE_ROW_SIZE] = memory[encoders + i]
 
 
 @njit(cache=True)
@@ -481,14 +468,12 @@ def _apply_calibration_errors(constants, truth, out):
 
 
 @njit(cache=True)
-def _quantize(constants, first, end, channels):
+def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum, limit, value = (
-            constants[_QUANTUM_START + i],
-            constants[_RANGE_START + i],
-            channels[i],
-        )
+        quantum = constants[_QUANTUM_START + i]
+        limit = constants[_RANGE_START + i]
+        value = channels[i]
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)
         if abs(value) >= limit:

@@ -55,19 +55,19 @@ from drake_teleop.station.environment.moving_bodies import interpolate_joint_sta
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
-    motion_estimator,
+    initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     FILTER_MEMORY_START,
     LOST_FLAG_SAMPLES,
-    NOISE_SIZE,
+    NOISE_BLOCK_SIZE,
     OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
-    is_plausible,
+    are_values_plausible,
+    initialize_sensor_chain,
     read_sensor_into,
-    sensor_chain_constants,
 )
 from drake_teleop.station.slave.arm import (
     FRAME_STATE_SIZE,
@@ -91,14 +91,14 @@ from drake_teleop.station.slave.plant_dynamics import (
 Array = NDArray[np.float64]
 
 #: Tolerance of equal instants, in periods.
-_TIME_TOLERANCE = 1e-6
+_TIME_TOLERANCE_PERIODS = 1e-6
 #: Largest number of queued steps.
 _MAX_QUEUED_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
+_ACCELERATION_CHECK_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
 #: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
-_NO_GIVEN_WRENCH = np.zeros(0)
+_USE_COMPILED_CONTACT = np.zeros(0)
 
 
 @njit(cache=True)
@@ -110,11 +110,9 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     """
     sensor_motion(arm, q, v, vdot, motion)
     copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
-    s, omega, alpha = (
-        out[SAMPLE_SPECIFIC_FORCE],
-        out[SAMPLE_ANGULAR_VELOCITY],
-        out[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = out[SAMPLE_SPECIFIC_FORCE]
+    omega = out[SAMPLE_ANGULAR_VELOCITY]
+    alpha = out[SAMPLE_ANGULAR_ACCELERATION]
     wrench = out[SAMPLE_WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
@@ -154,18 +152,12 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
-    if not is_plausible(constants, truth):  # keeps it out of the filters
+    if not are_values_plausible(constants, truth):  # keeps it out of the filters
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(
-            sample,
-            SAMPLE_WRENCH_AND_MOTION.start,
-            truth,
-            SAMPLE_WRENCH_AND_MOTION.start,
-            SAMPLE_WRENCH_AND_MOTION.stop,
-        )
+        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
         sample[SATURATION_FLAG_INDEX] = 0.0
         copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
     else:
@@ -195,7 +187,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 
 @njit(cache=True)
-def _torque_at_offset_into(held, after, torque):
+def _extrapolate_torque_into(held, after, torque):
     copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -239,7 +231,7 @@ def take_due_samples(
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_plant_state(state, around, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
-    _torque_at_offset_into(held, 0.0, tau)
+    _extrapolate_torque_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
         environment_wrench(
@@ -255,29 +247,29 @@ def take_due_samples(
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
-        if (count + _TIME_TOLERANCE) * period >= until:
+        if (count + _TIME_TOLERANCE_PERIODS) * period >= until:
             continue
-        _torque_at_offset_into(held, start[0] - time, tau)
+        _extrapolate_torque_into(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _torque_at_offset_into(held, until - time, tau)
+            _extrapolate_torque_into(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
-        while (count + _TIME_TOLERANCE) * period < until:
+        while (count + _TIME_TOLERANCE_PERIODS) * period < until:
             u = (count * period - start[0]) / h
             _interpolate_state(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
-            _torque_at_offset_into(held, count * period - time, tau)
+            _extrapolate_torque_into(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
-    taken = (count - 1.0 + _TIME_TOLERANCE) * period > time
+    taken = (count - 1.0 + _TIME_TOLERANCE_PERIODS) * period > time
     copy_into(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _TIME_TOLERANCE) * period < time:
+    if until_now and (count - _TIME_TOLERANCE_PERIODS) * period < time:
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
@@ -298,7 +290,7 @@ class WristSensor(LeafSystem):
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         - contact_results: contact results of the plant (only with surroundings)
-        - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
+        - noise: (NOISE_BLOCK_SIZE,) standard normal numbers (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
@@ -324,17 +316,21 @@ class WristSensor(LeafSystem):
         super().__init__()
         arm = slave.arm
         n = self._n = arm.num_joints
-        constants, chain = sensor_chain_constants(config, n, period)
-        motion_constants, estimator = motion_estimator(motion, config, n, period)
-        self._offset = constants[OFFSET_CONSTANTS]
+        constants, chain = initialize_sensor_chain(config, n, period)
+        motion_constants, estimator = initialize_motion_estimator(motion, config, n, period)
         self._physics, contact = slave.physics_of_plant, slave.contact
+        #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
+        #: are views that may be changed during a run.
+        self.offset, self.phi = constants[OFFSET_CONSTANTS], self._physics[1]
+        self.contact_pairs = self._physics[2]
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[SAMPLE_WRENCH] += config.offset
-        # Contact needs many steps per torque sample, so queueing them saves time.
-        self._beyond_contact_law = contact.beyond
+        #: Reason why contact is outside the compiled contact law, or "".
+        self.reason_beyond_contact_law = contact.beyond
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.beyond)
+        # Contact needs many steps per torque sample, so queueing them saves time.
         self._max_queued_steps = _MAX_QUEUED_STEPS if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
@@ -343,13 +339,14 @@ class WristSensor(LeafSystem):
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         # No reference to the plant: it would be a cycle with the Diagram that owns this block.
         self._watched, self._plant_size = contact.watched, contact.plant_size
-        self._moving = tuple(contact.moving)
+        #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
+        self.moving_bodies_sentence = ", ".join(contact.moving) + " can move" * bool(contact.moving)
         self._twin_arguments = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
-        self._no_noise, self._zero_wrench = np.zeros(NOISE_SIZE), np.zeros(6)
+        self._no_noise, self._zero_wrench = np.zeros(NOISE_BLOCK_SIZE), np.zeros(6)
         self._no_rate = np.zeros(0)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
@@ -367,7 +364,7 @@ class WristSensor(LeafSystem):
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = contact.bodies, contact.shapes
         if not config.ideal:
-            self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
+            self._noise = self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._memory_slice = slice(len(first) + 1, None)  # memory in the output
@@ -381,36 +378,11 @@ class WristSensor(LeafSystem):
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
-        if self._beyond_contact_law:
+        if self.reason_beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
-        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD_S, 0.0, self._check_acceleration)
-
-    @property
-    def offset(self) -> Array:
-        """Offset (6,) of force and torque [N, N m]; a view that may be changed during a run."""
-        return self._offset
-
-    @property
-    def phi(self) -> Array:
-        """Inertial parameters (10,) of the tool; a view that may be changed during a run."""
-        return self._physics[1]
-
-    @property
-    def contact_pairs(self) -> Array:
-        return self._physics[2]
-
-    @property
-    def reason_beyond_contact_law(self) -> str:
-        """Reason why contact is outside the compiled contact law, or ""."""
-        return self._beyond_contact_law
-
-    @property
-    def moving_bodies_sentence(self) -> str:
-        """Sentence that names the moving bodies around the arm except a sheet spring, or ""."""
-        names = ", ".join(self._moving)
-        return f"{names} can move" if names else ""
+        self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_S, 0.0, self._check_acceleration)
 
     @property
     def motion_dependent_indices(self) -> NDArray[np.intp]:
@@ -424,7 +396,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         seen = self._arm_state_and_surroundings(context)
         self._take_samples(
-            context, seen, self._contact_proximity(*seen), False, _NO_GIVEN_WRENCH, self._result
+            context, seen, self._tool_proximity(*seen), False, _USE_COMPILED_CONTACT, self._result
         )
         context.SetDiscreteState(self._result[self._memory_slice])
 
@@ -432,42 +404,59 @@ class WristSensor(LeafSystem):
         """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
-        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
+        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE_PERIODS), 0.0
         append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
     def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
-        return self._state.Eval(context), self._evaluate_surroundings(context)
-
-    def _evaluate_surroundings(self, context: Context) -> Array:
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
-        return self._around if self._sheet is None else self._sheet.Eval(context)
+        around = self._around if self._sheet is None else self._sheet.Eval(context)
+        return self._state.Eval(context), around
 
     def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _contact_proximity(self, state: Array, around: Array) -> int:
+    def _tool_proximity(self, state: Array, around: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
-        if self._beyond_contact_law:
+        if self.reason_beyond_contact_law:
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
         return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
-    def _plant_contact_about_world(self, context: Context) -> Array:
+    def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _plant_contact_about_So(self, context: Context) -> Array:
-        wrench_W = self._plant_contact_about_world(context).copy()
+    def _plant_contact_wrench_So_W(self, context: Context) -> Array:
+        wrench_W = self._plant_contact_wrench_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
-    def _evaluate_inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
-        return (
+    def _calc_step(self, context: Context, output: BasicVector) -> None:
+        seen = self._arm_state_and_surroundings(context)
+        near = self._tool_proximity(*seen)
+        if near == PROXIMITY_FAR:
+            touching_W = self._zero_wrench
+        elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
+            touching_W = self._plant_contact_wrench_W(context)
+        else:
+            touching_W = _USE_COMPILED_CONTACT
+        self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
+
+    def _take_samples(
+        self,
+        context: Context,
+        seen: tuple[Array, Array],
+        near: int,
+        until_now: bool,
+        touching_W: Array,
+        result: Array,
+    ) -> None:
+        inputs = (
             self._physics,
             self._sensor,
             self._period,
@@ -481,28 +470,6 @@ class WristSensor(LeafSystem):
             self._no_noise if self._noise is None else self._noise.Eval(context),
             context.get_discrete_state_vector().value(),
         )
-
-    def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._arm_state_and_surroundings(context)
-        near = self._contact_proximity(*seen)
-        if near == PROXIMITY_FAR:
-            touching_W = self._zero_wrench
-        elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
-            touching_W = self._plant_contact_about_world(context)
-        else:
-            touching_W = _NO_GIVEN_WRENCH
-        self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
-
-    def _take_samples(
-        self,
-        context: Context,
-        seen: tuple[Array, Array],
-        near: int,
-        until_now: bool,
-        touching_W: Array,
-        result: Array,
-    ) -> None:
-        inputs = self._evaluate_inputs(context, seen)
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
@@ -524,7 +491,7 @@ class WristSensor(LeafSystem):
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
             seen = self._arm_state_and_surroundings(context)
-            if not self._watched.size or self._contact_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
+            if not self._watched.size or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
@@ -532,7 +499,7 @@ class WristSensor(LeafSystem):
 
     def _are_samples_due(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
-        margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
+        margin, (held, block) = _TIME_TOLERANCE_PERIODS * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
@@ -546,17 +513,14 @@ class WristSensor(LeafSystem):
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
         physics = self._physics
-        if (
-            self._beyond_contact_law
-            or self._contact_proximity(state, around) == PROXIMITY_NEAR_MONITORED
-        ):
-            applied = applied + self._plant_contact_about_So(context)
+        near = self._tool_proximity(state, around)
+        if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
+            applied = applied + self._plant_contact_wrench_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
-        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ACCELERATION_TOLERANCE * (
-            1.0 + np.abs(vdot).max()
-        ):
+        error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
+        if not error < _ACCELERATION_TOLERANCE * (1.0 + size):
             raise DrakeTeleopError(
                 f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
                 "not receive it",
@@ -569,11 +533,9 @@ class WristSensor(LeafSystem):
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
-    touching, motion, truth = (
-        np.zeros(6),
-        np.zeros(FRAME_STATE_SIZE),
-        sample[SAMPLE_WRENCH_AND_MOTION],
-    )
+    touching = np.zeros(6)
+    motion = np.zeros(FRAME_STATE_SIZE)
+    truth = sample[SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
     sample[SAMPLE_JOINT_POSITION] = q
     return sample
@@ -597,24 +559,18 @@ def AddCompiledWristSensor(
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
     if not config.ideal:
-        noise = builder.AddNamedSystem(
-            "wrist_sensor_noise",
-            RandomSource(
-                RandomDistribution.kGaussian, NOISE_SIZE, SAMPLES_PER_NOISE_BLOCK * period
-            ),
-        )
+        block_s = SAMPLES_PER_NOISE_BLOCK * period
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
+        builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     if slave.sheet_in_compiled_law is not None:
-        builder.Connect(
-            slave.plant.get_state_output_port(slave.sheet_in_compiled_law),
-            sensor.GetInputPort("sheet_state"),
-        )
+        sheet = slave.plant.get_state_output_port(slave.sheet_in_compiled_law)
+        builder.Connect(sheet, sensor.GetInputPort("sheet_state"))
     if slave.contact.plant_size:
         builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
     if slave.can_touch:
-        builder.Connect(
-            slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
-        )
+        results = slave.plant.get_contact_results_output_port()
+        builder.Connect(results, sensor.GetInputPort("contact_results"))
     parts = signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")

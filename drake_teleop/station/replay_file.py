@@ -65,14 +65,14 @@ class DisplayedNumber:
     Args:
         values: (F,) one value per frame; NaN where the number does not exist.
         colour: colour of its curve, "#rrggbb"; "" for no curve. All curves share one scale.
-        arrow: True if the scene shows arrows of this colour for it.
+        has_arrow: True if the scene shows arrows of this colour for it.
     """
 
     name: str
     unit: str
     values: Array
     colour: str = ""
-    arrow: bool = False
+    has_arrow: bool = False
 
     def data_for_page(self) -> dict[str, object]:
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
@@ -80,7 +80,7 @@ class DisplayedNumber:
             "name": self.name,
             "unit": self.unit,
             "colour": self.colour,
-            "arrow": self.arrow,
+            "arrow": self.has_arrow,
             "digits": 1 if largest >= 10 else 2,
             "values": [None if np.isnan(x) else round(float(x), 3) for x in self.values],
         }
@@ -95,7 +95,7 @@ class ReplayFile:
         slow_motion: initial factor: seconds of replay per second of `times`.
         readings: numbers that the page displays.
         shaded: time spans (start, stop) that are shaded behind the curves.
-        clock, curves: labels; "{top}" in `curves` is replaced by the largest value.
+        clock_label, curves_label: "{top}" in `curves_label` is replaced by the largest value.
     """
 
     title: str
@@ -104,8 +104,8 @@ class ReplayFile:
     readings: Sequence[DisplayedNumber] = ()
     shaded: Sequence[tuple[float, float]] = ()
     notes: Sequence[str] = ()
-    clock: str = "simulated time"
-    curves: str = ""
+    clock_label: str = "simulated time"
+    curves_label: str = ""
 
     def write(self, path: Path, make_scene: Callable[[Meshcat], ShowFrame]) -> None:
         """Write the replay to an HTML file.
@@ -153,8 +153,8 @@ class ReplayFile:
             "readings": [reading.data_for_page() for reading in self.readings],
             "shaded": [(a - start, b - start) for a, b in self.shaded],
             "notes": list(self.notes),
-            "clock": self.clock,
-            "curves": self.curves,
+            "clock": self.clock_label,
+            "curves": self.curves_label,
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
@@ -218,8 +218,8 @@ class ForceArrow:
         head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
 
-    def show_force(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `film_time` [s]."""
+    def show_force(self, canvas: Canvas, replay_time: float, place: Array, force: Array) -> None:
+        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `replay_time` [s]."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
@@ -227,12 +227,12 @@ class ForceArrow:
         middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
         back = along @ _HALF_TURN_ABOUT_X
         put = canvas.SetTransform
-        put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
-        put(f"{self._path}/head", RigidTransform(back, tip), film_time)
+        put(f"{self._path}/shaft", RigidTransform(along, middle), replay_time)
+        put(f"{self._path}/head", RigidTransform(back, tip), replay_time)
         scale = canvas.SetProperty
         size = min(1.0, length / _HEAD_LENGTH_M)
-        scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
-        scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)
+        scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], replay_time)
+        scale(f"{self._path}/head/scaled", "scale", [size, size, size], replay_time)
 
 
 @contextmanager

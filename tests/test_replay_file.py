@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from drake_teleop.station.film import DisplayedNumber, ReplayFile, frame_times
+from drake_teleop.station.replay_file import DisplayedNumber, ReplayFile, frame_times
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_page_escapes_all_texts_and_numbers(tmp_path):
     reading = DisplayedNumber("<b>", "N", np.array([np.nan, 1.23456, 20.0]), "#0072B2")
     film = ReplayFile("</script><b>&", np.array([0.0, 0.5, 1.0]), 1.0, [reading], notes=("<i>",))
     frames = []
-    film.write(tmp_path / "film.html", lambda meshcat: lambda film_time, k: frames.append(k))
+    film.write(tmp_path / "film.html", lambda meshcat: lambda replay_time, k: frames.append(k))
     assert frames == [0, 1, 2]
     page = (tmp_path / "film.html").read_text(encoding="utf-8")
     player = page[page.index('<div id="player">') :]
