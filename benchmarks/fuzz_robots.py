@@ -20,7 +20,15 @@ from drake_teleop.robots.ros2_messages import MESSAGE_TYPES
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
 from drake_teleop.robots.rtde import parts_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
-from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading
+from drake_teleop.robots.streams import (
+    IMU,
+    JOINTS,
+    NONZERO_WRENCH_FLAGS,
+    POSE,
+    WRENCH,
+    Part,
+    Reading,
+)
 
 LOAD = Identification(
     phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003])),
@@ -136,11 +144,11 @@ def _pieces(content: bytes, size: int) -> list[bytes]:
 def _checked(assembly: Assembly, parts: Iterator[Part]) -> None:
     compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
     for k, part in enumerate(parts):
-        found: list[Reading] = assembly.complete_readings(part, DT * k / 3)
+        found: list[Reading] = assembly.readings_completed_by(part, DT * k / 3)
         for reading in found:
             out = compensator.step(reading, DT * k / 3)
             numbers = np.array([out.t, *out.contact, *out.scaled])
-            zero = bool(out.flags & ~NONZERO_FLAGS)
+            zero = bool(out.flags & ~NONZERO_WRENCH_FLAGS)
             if not np.isfinite(numbers).all() or (np.abs(numbers[1:]) > RANGE).any():
                 raise AssertionError(f"{out!r}")
             if zero and numbers[1:].any():

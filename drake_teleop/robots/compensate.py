@@ -91,7 +91,7 @@ def compensate_stream(
                 write(out)
                 if changes is not None:
                     changes.add_reading(reading, out.flags)
-                if compensator.good_count >= tare_count:
+                if compensator.good_readings_in_row >= tare_count:
                     tare_count = np.inf
                     report(f"tare {compensator.tare()}")
             if control is not None:

@@ -22,13 +22,13 @@ from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFla
 PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
 RECORD_FORMAT = struct.Struct(">III6i")
-START, STOP = 2, 0
+START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
-_SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
-_REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
+_SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
+_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
 _MAX_RECORDS = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
-_SI_VALUE_OF_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
+_SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
 class RdtRecord(NamedTuple):
@@ -54,12 +54,12 @@ class NetFtSource:
 
     def __init__(self, address: str, dt: float | None = None) -> None:
         parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
-        counts, rate = parsed.read_numbers("counts", 2), parsed.read_numbers("rate", 1)
+        counts, rate = parsed.positive_numbers("counts", 2), parsed.positive_numbers("rate", 1)
         sign = parsed.wrench_sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _read_sensor_page(parsed)
+            page = _read_counts_and_rate(parsed)
             counts = counts or page[:2]
             rate = rate or page[2:]
         self.dt = 1.0 / rate[0]
@@ -96,13 +96,13 @@ class NetFtSource:
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._last_received = now
         flags = 0
-        if record.status & _SATURATED:
+        if record.status & _SATURATED_STATUS_BIT:
             flags = int(ReadingFlag.SATURATED)
-        elif record.status & _ERROR:
+        elif record.status & _ERROR_STATUS_BIT:
             flags = int(ReadingFlag.DAMAGED)
         if record.ft_sequence != self._measured:
             self._measured, self._measured_at = record.ft_sequence, now
-        elif now - self._measured_at > _MAX_UNCHANGED_S:
+        elif now - self._measured_at > _MAX_UNCHANGED_WRENCH_S:
             flags |= int(ReadingFlag.STALE)
         t = self._pace.time_of_sample(self._number, now)
         return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
@@ -111,18 +111,18 @@ class NetFtSource:
         now = time.monotonic()
         if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
             self._last_request = now
-            self._send_command(START)
+            self._send_command(START_COMMAND)
 
     def _send_command(self, command: int) -> None:
         with suppress(OSError):  # no box yet
             self._socket.send(REQUEST_FORMAT.pack(_REQUEST_HEADER, command, 0))
 
     def close(self) -> None:
-        self._send_command(STOP)
+        self._send_command(STOP_COMMAND)
         self._socket.close()
 
 
-def _read_sensor_page(address: Address) -> list[float]:
+def _read_counts_and_rate(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
     remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
@@ -130,7 +130,7 @@ def _read_sensor_page(address: Address) -> list[float]:
     connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return parse_sensor_page(connection.getresponse().read(_MAX_PAGE_BYTES))
+        return parse_counts_and_rate(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
@@ -141,13 +141,14 @@ def _read_sensor_page(address: Address) -> list[float]:
         connection.close()
 
 
-def parse_sensor_page(content: bytes) -> list[float]:
+def parse_counts_and_rate(content: bytes) -> list[float]:
     """Return counts per N and per N m, and the rate [Hz], of the page netftapi2.xml."""
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
     counts = [
-        float(text[f"cfgcp{kind}"]) / _SI_VALUE_OF_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
+        float(text[f"cfgcp{kind}"])
+        / _SI_VALUE_OF_SENSOR_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
         for kind in ("f", "t")
     ]
     values = [*counts, float(text["comrdtrate"])]
@@ -156,7 +157,7 @@ def parse_sensor_page(content: bytes) -> list[float]:
     return values
 
 
-_MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
+_MIN_CLOCK_SPAN_S, _MAX_CLOCK_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
 _RESTART_STEP_S = 1.0  # a larger step of the number is a restart
 
 
@@ -176,9 +177,9 @@ class SampleClock:
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _RESTART_STEP_S:
             self._first = number, now
-        elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
+        elif now - self._first[1] >= _MIN_CLOCK_SPAN_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])
-            if now - self._first[1] > _MAX_SPAN_S:
+            if now - self._first[1] > _MAX_CLOCK_SPAN_S:
                 self._first = number, now
         t = self._t + step * self._period
         if step > 0 or self._first == (number, now):

@@ -24,7 +24,7 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of_address,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Part, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, Compensated, Part, ReadingFlag
 
 _NODE_NAME = "drake_teleop"
 _DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
@@ -167,7 +167,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data
 
         topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.read_word("wrench", ("contact", "scaled"))
+        self._which = parsed.chosen_word("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
         kinds += ["diagnostic_msgs/msg/KeyValue"]
@@ -207,7 +207,7 @@ class Ros2Sink:
     def _diagnostics_message(self, out: Compensated, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
-        if out.flags & ~NONZERO_FLAGS:
+        if out.flags & ~NONZERO_WRENCH_FLAGS:
             level = kind.STALE if out.flags == ReadingFlag.STALE else kind.ERROR
         pairs = {"number": out.number, "t": repr(float(out.t)), "flags": out.flags, **self._counts}
         values = [self._kinds.KeyValue(key=key, value=str(value)) for key, value in pairs.items()]

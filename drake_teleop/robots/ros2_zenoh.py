@@ -27,9 +27,9 @@ from drake_teleop.robots.ros2_messages import (
 from drake_teleop.robots.streams import Compensated, Part
 
 PORT = 7447
-_NUMBER_FORMAT = struct.Struct("<qq")
+_NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
 _ATTACHMENT_FORMAT = struct.Struct("<qqB16s")
-_OLD_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
+_OLD_ATTACHMENT_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
 _MAX_QUEUED_MESSAGES = 4096  # queued messages; newer ones are dropped
 _NODE_NAME = "drake_teleop"
 
@@ -87,9 +87,12 @@ def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
 
 def message_number(attached: bytes) -> int | None:
     if len(attached) == _ATTACHMENT_FORMAT.size:
-        return int(_NUMBER_FORMAT.unpack_from(attached)[0])
-    if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
-        return int(struct.unpack_from("<q", attached, len(_OLD_PREFIX))[0])
+        return int(_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
+    if (
+        attached.startswith(_OLD_ATTACHMENT_PREFIX)
+        and len(attached) >= len(_OLD_ATTACHMENT_PREFIX) + 8
+    ):
+        return int(struct.unpack_from("<q", attached, len(_OLD_ATTACHMENT_PREFIX))[0])
     return None
 
 
@@ -176,7 +179,7 @@ class ZenohSink:
     def __init__(self, address: str) -> None:
         parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
-        which = parsed.read_word("wrench", ("contact", "scaled"))
+        which = parsed.chosen_word("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which
         self._frame = parsed.optional_parameter("frame") or ""

@@ -35,7 +35,7 @@ class ReadingFlag(IntFlag):
     OTHER_LOAD = 4096  #: explained by another load; the wrench is not zero
 
 
-NONZERO_FLAGS = (
+NONZERO_WRENCH_FLAGS = (
     ReadingFlag.WRONG_RATE | ReadingFlag.CLIPPED | ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD
 )
 """Flags with a nonzero wrench."""

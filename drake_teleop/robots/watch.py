@@ -33,19 +33,23 @@ from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
 
-MODEL_ERROR_FRACTION = 0.02
+LOAD_WRENCH_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
-MIN_NOISE_1_KHZ = np.repeat([0.05, 0.0025], 3)
+MIN_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_NEVER_REPLACED_BOUND = 1e-12  # accuracy at which another load would replace the present one
+_UNREACHABLE_LOAD_ACCURACY = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
-_NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
+_NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
     """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
-    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
-    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE_1_KHZ * math.sqrt(1e-3 / dt))
+    share = (
+        1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH_OVER_CUTOFF * cutoff_hz * dt)
+    )
+    return np.maximum(
+        load.residual_rms / math.sqrt(share), MIN_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt)
+    )
 
 
 class ContactAndLoadMonitor:
@@ -55,7 +59,11 @@ class ContactAndLoadMonitor:
         noise = unfiltered_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_detector_parameters(
-            noise, np.zeros(9), dt, model_error=MODEL_ERROR_FRACTION, bound=_NEVER_REPLACED_BOUND
+            noise,
+            np.zeros(9),
+            dt,
+            model_error=LOAD_WRENCH_ERROR_FRACTION,
+            bound=_UNREACHABLE_LOAD_ACCURACY,
         )
         self._phi = usable_phi(load)[0]
         self._covariance = limit_covariance(self._phi, load.covariance)
@@ -78,10 +86,10 @@ class ContactAndLoadMonitor:
         return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0
 
 
-CONTACT_MEAN_S = 3.0
+MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
-_STATISTIC = "level"
+_CONTACT_STATISTIC = "level"
 _RATE_TOLERANCE = 0.05
 
 
@@ -121,9 +129,13 @@ class StreamContactDetector:
         covariance = limit_covariance(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
+        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_CONTACT_STATISTIC))
         self._settings = ContactDetector(
-            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / CONTACT_MEAN_S
+            floor,
+            threshold,
+            statistic=_CONTACT_STATISTIC,
+            hold=hold,
+            following=dt / MEAN_WRENCH_TIME_CONSTANT_S,
         ).settings
         self.restart()
         self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading

@@ -28,7 +28,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
-from drake_teleop.robots.netft import NetFtSource, parse_sensor_page
+from drake_teleop.robots.netft import NetFtSource, parse_counts_and_rate
 from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import (
@@ -285,9 +285,9 @@ def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
 def test_netft_page_contains_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
-    assert parse_sensor_page(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+    assert parse_counts_and_rate(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
-            parse_sensor_page(bad)
+            parse_counts_and_rate(bad)
     with pytest.raises(DrakeTeleopError, match=r"page .*; check the host, or give netft://HOST"):
         NetFtSource("netft://127.0.0.9")

@@ -72,8 +72,8 @@ def played(
     for k in range(round(seconds / DT)):
         t = k * DT
         if k % 2 == 0 and not lost(k):
-            found += assembly.complete_readings(Part(POSE, k // 2, t + later, truth(t)[0]), t)
-        found += assembly.complete_readings(wrench_at(t, k), t)
+            found += assembly.readings_completed_by(Part(POSE, k // 2, t + later, truth(t)[0]), t)
+        found += assembly.readings_completed_by(wrench_at(t, k), t)
     return found
 
 
@@ -139,11 +139,11 @@ def test_invalid_and_out_of_order_poses_are_ignored() -> None:
         (truth(0.3)[0], math.nan),
         (truth(0.3)[0], math.inf),
     ):
-        assert assembly.complete_readings(Part(POSE, 0, t, values), 0.3) == []
+        assert assembly.readings_completed_by(Part(POSE, 0, t, values), 0.3) == []
     after = [
         each
         for k in range(300, 400)
-        for each in assembly.complete_readings(wrench_at(k * DT, k), k * DT)
+        for each in assembly.readings_completed_by(wrench_at(k * DT, k), k * DT)
     ]
     assert after == []  # as no more motions are known
 
@@ -160,7 +160,9 @@ def test_assembly_accepts_a_clock_that_is_set_back() -> None:
         if k % 2 == 0:
             parts.insert(0, Part(POSE, k, t, truth(t)[0]))
         for part in parts:
-            out += [compensator.step(each, now) for each in assembly.complete_readings(part, now)]
+            out += [
+                compensator.step(each, now) for each in assembly.readings_completed_by(part, now)
+            ]
     left = [row.contact for row in out if not row.flags]
     assert len(left) > 50 and np.abs(left).max() < 0.03
     assert any(row.flags & ReadingFlag.CLOCK_JUMP for row in out)
@@ -170,8 +172,8 @@ def test_imu_gives_the_motion() -> None:
     assembly, found = Assembly(PartStreams(StreamStub(WRENCH, IMU))), []
     for k in range(250):
         t = k * DT
-        found += assembly.complete_readings(Part(IMU, k, t, truth(t)[1][:6]), t)
-        found += assembly.complete_readings(wrench_at(t, k), t)
+        found += assembly.readings_completed_by(Part(IMU, k, t, truth(t)[1][:6]), t)
+        found += assembly.readings_completed_by(wrench_at(t, k), t)
     good = [each for each in found if not each.flags]
     wanted = np.array([truth(each.t)[1] for each in good])
     motion = np.array([each.values[6:] for each in good])

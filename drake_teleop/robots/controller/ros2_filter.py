@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from drake_teleop.robots.controller.c99 import (
+    ControllerTarget,
     Files,
-    Target,
     kernel_files,
     read_template,
     render_template,
@@ -14,7 +14,7 @@ _FILTER_NAME = "wrench_compensator_filter"
 _TEMPLATE_FOLDER = "ros2_filter"
 
 
-def ros2_filter_files(target: Target) -> Files:
+def ros2_filter_files(target: ControllerTarget) -> Files:
     shipped = {
         f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
         "package.xml": "package.xml",
