@@ -70,7 +70,7 @@ def test_the_vector_contains_each_flag(exported):
     expected = {
         0,
         ReadingFlag.SATURATED,
-        ReadingFlag.VALUE_NOT_FINITE,
+        ReadingFlag.NOT_FINITE,
         ReadingFlag.OUT_OF_RANGE,
         ReadingFlag.CLIPPED,
     }
