@@ -52,7 +52,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     scenario = live_scenario(LoadScenario("contact_transition"))
     load = identified_load(scenario)
     clock = time.perf_counter
-    live = Live(scenario, load, folder, PageScene("own", scenario).show, clock())
+    live = Live(scenario, load, folder, PageScene("own", scenario).frame_part, clock())
     live.join(1, clock())
     for _ in range(200):  # what is compiled and loaded at the first call
         live.tick(clock)
@@ -65,7 +65,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         if now >= next_message:
             next_message += FRAME_PERIOD_S
             live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.is_idle and live.pace.time_to_next_slice(now) <= 0:
+        if not live.is_simulation_halted and live.pace.time_to_next_slice(now) <= 0:
             late.append(-live.pace.time_to_next_slice(now))
         frame = live.tick(clock)
         if frame is not None:

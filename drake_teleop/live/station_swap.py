@@ -137,7 +137,7 @@ class CrossFade(LeafSystem):
         """Limit the force to `most` [N] until the new wrench is at most that large."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
-    def removed_force(self, context: Context) -> float:
+    def force_above_limit(self, context: Context) -> float:
         """Return the force [N] by which `LimitForce` reduces the wrench; 0 during a cross-fade."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force_norm(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0

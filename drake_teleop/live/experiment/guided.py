@@ -16,7 +16,7 @@ from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.station.operator.task import Insert
@@ -28,7 +28,13 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+_BLANK_FRAME_VALUES = {
+    "contact": False,
+    "energy": [0.0, 0.0],
+    "words": [],
+    "record": "",
+    "scene": "own",
+}
 
 #: Names of the inputs that move the hand.
 HAND_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
@@ -51,7 +57,7 @@ class GuidedExperiment:
         procedure: Procedure,
         stations: dict[tuple[int, int], Apparatus],
         scenarios: list[Scenario],
-        store: Store,
+        store: TrialStore,
         shows: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
@@ -120,9 +126,9 @@ class GuidedExperiment:
         self._live.leave(self._driver, now)
         self._driver = None
         self._procedure.restart_trial()
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
 
-    def _prepare_if_changed(self, now: float) -> None:
+    def _prepare_interval_if_changed(self, now: float) -> None:
         with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
                 self._live.end_session()
@@ -156,7 +162,7 @@ class GuidedExperiment:
             procedure.advance_phase()
         if (procedure.phase, procedure.trial_number) == before:
             return
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
         self._since = now
         if procedure.phase == INTERVAL:
             self._live.pace.restart(now)
@@ -211,7 +217,7 @@ class GuidedExperiment:
         result = dataclasses.replace(result, lost_s=live.pace.given_up)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
         inner = self._live.frame()
@@ -225,7 +231,7 @@ class GuidedExperiment:
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
-            **_BLANK_VALUES,
+            **_BLANK_FRAME_VALUES,
             "f": [rendered] * 3,
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,

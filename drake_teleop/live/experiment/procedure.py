@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_teleop.live.experiment.design import ContactDetection, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import Psi
-from drake_teleop.live.experiment.store import Store, TrialRow
+from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
 #: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
 CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
@@ -20,12 +20,12 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """Planned trial; `signal` is the interval with the stimulus, 1 or 2, or 0 for the peg task."""
+    """Planned trial; `signal_interval` (1 or 2) has the stimulus; 0 for the peg task."""
 
     task: int
     condition: int
     practice: bool
-    signal: int
+    signal_interval: int
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class Procedure:
     Attributes:
         level: intended level of the trial's stimulus [N or kg].
         prepared_intervals: number of intervals, also repeated ones.
-        said: whether the last answer was right.
-        again: whether the trial is repeated because the tool made no contact.
+        is_answer_right: whether the last answer was right.
+        is_repeated: whether the trial is repeated because the tool made no contact.
     """
 
-    def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
+    def __init__(self, experiment: Experiment, participant: int, store: TrialStore) -> None:
         self.experiment, self.participant, self._store = experiment, participant, store
         self.trials = plan_trials(experiment, participant)
         self._rows = store.read_rows(participant)
@@ -88,7 +88,7 @@ class Procedure:
         self._pressed: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._update_estimates(trial, row)
-        self.phase, self.said, self.again = CONSENT, False, False
+        self.phase, self.is_answer_right, self.is_repeated = CONSENT, False, False
         self.prepared_intervals = 0
         self._prepare_trial()
 
@@ -107,7 +107,7 @@ class Procedure:
     @property
     def current_level(self) -> float:
         """Stimulus level of the present interval [N or kg]; 0 without stimulus."""
-        return self.level if self.trial.signal == self.interval else 0.0
+        return self.level if self.trial.signal_interval == self.interval else 0.0
 
     @property
     def expected_force(self) -> float:
@@ -131,7 +131,7 @@ class Procedure:
         elif self.phase in (TASK, BREAK):
             self.phase = READY
         elif self.phase == READY:
-            self.phase, self.again = INTERVAL, False
+            self.phase, self.is_repeated = INTERVAL, False
         elif self.phase == FEEDBACK:
             self._start_next_trial()
 
@@ -140,8 +140,8 @@ class Procedure:
         self._results[self.interval - 1] = result
         if not result.valid:
             self._prepare_trial()
-            self.phase, self.again = READY, True
-        elif self.trial.signal == 0:
+            self.phase, self.is_repeated = READY, True
+        elif self.trial.signal_interval == 0:
             self._finish_trial(0, result.done, result.time_s)
         elif self.interval == 1:
             self.interval, self.phase = 2, GAP
@@ -160,7 +160,7 @@ class Procedure:
     def store_answer(self, interval: int, time_s: float) -> None:
         """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
         if self.phase == ANSWER:
-            self._finish_trial(interval, interval == self.trial.signal, time_s)
+            self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
@@ -170,7 +170,7 @@ class Procedure:
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
             level=max(f.level for f in results),
-            signal=trial.signal,
+            signal=trial.signal_interval,
             answer=answer,
             correct=int(correct),
             time_s=round(time_s, 4),
@@ -180,7 +180,7 @@ class Procedure:
         self._store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
         self._update_estimates(trial, row)
-        self.said = bool(correct)
+        self.is_answer_right = bool(correct)
         if trial.practice:
             self.phase = FEEDBACK
         else:
@@ -221,7 +221,7 @@ class Procedure:
             "trials": len(self.trials),
             "practice": trial.practice,
             "interval": self.interval,
-            "again": self.again,
-            "said": self.said if self.phase == FEEDBACK else None,
+            "again": self.is_repeated,
+            "said": self.is_answer_right if self.phase == FEEDBACK else None,
             "consent": self.experiment.consent if self.phase == CONSENT else "",
         }

@@ -13,20 +13,20 @@ from scipy.special import stdtrit
 from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import Estimate, Psi
-from drake_teleop.live.experiment.store import Store, TrialRow
+from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-_NORMAL_QUANTILE = 1.959964
-_PICTURED_QUANTITIES = (
+_NORMAL_QUANTILE_975 = 1.959964
+_DRAWN_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_DONE_SHARE_NAME = "share of trials done"
+_DONE_SHARE_QUANTITY = "share of trials done"
 
 
 class Result(NamedTuple):
@@ -42,7 +42,7 @@ class Result(NamedTuple):
     high: float
 
 
-def compute_results(experiment: Experiment, store: Store) -> list[Result]:
+def compute_results(experiment: Experiment, store: TrialStore) -> list[Result]:
     found = []
     numbers = store.participant_numbers()
     known = {n: [row for row in store.read_rows(n) if not row.practice] for n in numbers}
@@ -59,7 +59,7 @@ def compute_results(experiment: Experiment, store: Store) -> list[Result]:
                 found += one
                 if len(one) > 1:
                     over = _mean_with_interval(
-                        [r.value for r in one], share=quantity == _DONE_SHARE_NAME
+                        [r.value for r in one], share=quantity == _DONE_SHARE_QUANTITY
                     )
                     trials = sum(r.trials for r in one)
                     found.append(Result(kind, condition.name, 0, trials, quantity, *over))
@@ -71,7 +71,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_DONE_SHARE_NAME: _wilson_interval(len(done), len(rows))}
+        found = {_DONE_SHARE_QUANTITY: _wilson_interval(len(done), len(rows))}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -98,13 +98,13 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
 
 
 def _wilson_interval(successes: int, n: int) -> Estimate:
-    p, z2 = successes / n, _NORMAL_QUANTILE**2
+    p, z2 = successes / n, _NORMAL_QUANTILE_975**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _NORMAL_QUANTILE / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    half = _NORMAL_QUANTILE_975 / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
     return Estimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 
-def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
+def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
     import polars as pl
 
     found = compute_results(experiment, store)
@@ -117,7 +117,7 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
     table = pl.DataFrame(found, schema=schema, orient="row").with_columns(
         pl.col("value", "low", "high").fill_nan(None)
     )
-    write_table(store.folder / "trials.csv", store.results_table())
+    write_table(store.folder / "trials.csv", store.trials_table())
     write_table(store.folder / "results.csv", table)
     _write_picture(store.folder / "results.png", experiment, found)
     return table
@@ -127,7 +127,7 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
     from drake_teleop.common.style import Picture, plot_style
 
     shown = [
-        quantity for quantity in _PICTURED_QUANTITIES if any(r.quantity == quantity for r in found)
+        quantity for quantity in _DRAWN_QUANTITIES if any(r.quantity == quantity for r in found)
     ]
     if not shown:
         return

@@ -13,10 +13,10 @@ from drake_teleop.live.experiment.design import Experiment
 from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.simulated import make_all_apparatus
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
-from drake_teleop.live.server import LiveDrive, start_condition, warm_up
+from drake_teleop.live.server import LiveDrive, compile_session_functions, start_condition_text
 from drake_teleop.station.scenario import Scenario
 
 
@@ -27,7 +27,7 @@ class ExperimentDrive(LiveDrive):
         self,
         experiment: Experiment,
         scenarios: list[Scenario],
-        store: Store,
+        store: TrialStore,
         participant: int,
         port: int = 0,
         device: str | None = None,
@@ -44,11 +44,11 @@ class ExperimentDrive(LiveDrive):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
         first = self._stations[0, 0]
-        warm_up(first.scenario, first.load, device)
+        compile_session_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
-        shows = [view.show for view in self._views.values()]
+        shows = [view.frame_part for view in self._views.values()]
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
         return GuidedExperiment(*setup, time.perf_counter(), link)
 
@@ -66,7 +66,7 @@ class ExperimentDrive(LiveDrive):
 def serve_experiment(
     experiment: Experiment,
     scenarios: list[Scenario],
-    store: Store,
+    store: TrialStore,
     participant: int,
     *,
     port: int,
@@ -78,7 +78,7 @@ def serve_experiment(
     if browser:
         webbrowser.open(live.url)
     print(
-        f"participant {participant} at {live.url}\n{start_condition(device)}; Ctrl-C ends it",
+        f"participant {participant} at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it",
         flush=True,
     )
     reason, (done, trials) = live.wait_for_signal(), live.count_done_trials()

@@ -27,7 +27,7 @@ from drake_teleop.live.experiment.procedure import (
     IntervalResult,
     Procedure,
 )
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import LENGTH_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
@@ -63,7 +63,7 @@ def simulate_participant(
     experiment: Experiment,
     scenarios: list[Scenario],
     stations: dict[tuple[int, int], Apparatus],
-    store: Store,
+    store: TrialStore,
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
@@ -126,7 +126,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     session.close()
     return apparatus.interval_result(
         procedure.current_level, stimulus, rows
-    ), rows.largest_force_change(_MOTION_START_S)
+    ), rows.largest_rendered_force_change(_MOTION_START_S)
 
 
 def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:

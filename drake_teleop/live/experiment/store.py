@@ -17,7 +17,7 @@ from drake_teleop.lab.studies.store import locked_folder
 from drake_teleop.live.experiment.design import Experiment
 
 #: Largest valid participant number.
-MAX_PARTICIPANT = 9999
+MAX_PARTICIPANT_NUMBER = 9999
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ _TRIAL_SCHEMA: dict[str, type[pl.DataType]] = {
 
 
 @dataclass(frozen=True)
-class Store:
+class TrialStore:
     """Trials of an experiment on disk, in one folder."""
 
     folder: Path
@@ -85,7 +85,7 @@ class Store:
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_TRIAL_SCHEMA)
         write_table(self.participant_file(participant), table)
 
-    def results_table(self) -> pl.DataFrame:
+    def trials_table(self) -> pl.DataFrame:
         rows = [
             {"participant": n} | dataclasses.asdict(row)
             for n in self.participant_numbers()
@@ -95,9 +95,9 @@ class Store:
 
 
 @contextmanager
-def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[Store]:
+def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[TrialStore]:
     """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
     with locked_folder(folder, identity):
-        yield Store(folder)
+        yield TrialStore(folder)
