@@ -223,7 +223,7 @@ def driven(seconds: float) -> dict[str, float]:
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())
-        end, lost, late = clock() + seconds, live.pace.given_up, []
+        end, lost, late = clock() + seconds, live.pace.lost_time_s, []
         while clock() < end:
             if live.pace.time_to_next_slice(clock()) <= 0:
                 late.append(-live.pace.time_to_next_slice(clock()))
@@ -232,7 +232,7 @@ def driven(seconds: float) -> dict[str, float]:
         figures = link.link_statistics(clock())
         device.wait()
         found = json.loads(told.read_text())
-        lost = live.pace.given_up - lost
+        lost = live.pace.lost_time_s - lost
         live.close()
     return {
         "drive_factor": 1.0 - lost / seconds,

@@ -58,7 +58,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         live.tick(clock)
         time.sleep(live.time_to_next_tick(clock()))
     late, bytes_sent, touched, frames = [], 0, 0, 0
-    start, cpu, lost = clock(), time.process_time(), live.pace.given_up
+    start, cpu, lost = clock(), time.process_time(), live.pace.lost_time_s
     next_message = start
     while clock() - start < seconds:
         now = clock()
@@ -74,7 +74,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         time.sleep(live.time_to_next_tick(clock()))
     elapsed, cpu = clock() - start, time.process_time() - cpu
     p50, p95, p99, most = 1e3 * np.percentile(late, [50, 95, 99, 100])
-    lost = live.pace.given_up - lost
+    lost = live.pace.lost_time_s - lost
     live.close()
     return {
         "factor": 1.0 - lost / elapsed,

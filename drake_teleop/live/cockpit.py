@@ -20,7 +20,7 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 Array = NDArray[np.float64]
 
 #: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
-CONTACT_FORCE_N = 2.0
+MIN_CONTACT_FORCE_N = 2.0
 _AT_LIMIT_FRACTION = 0.999
 _HAND_FORCE_LIMIT_N = 59.0  # N; the limit of a hand is 60 N
 _PACKET_TIMEOUT_S = 0.05  # s
@@ -87,7 +87,9 @@ class Cockpit:
         smallest_and_largest_norm_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
         smallest_and_largest_norm_into(contact_S, zeros, contact)
         smallest_and_largest_norm_into(rows["force_to_master"], zeros, rendered)
-        in_contact = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT_FORCE_N
+        in_contact = (
+            rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
+        )
         self._forces[:2] *= inputs.force_scales["force_scale"]
         _integrate_work(
             self._table,
@@ -100,16 +102,18 @@ class Cockpit:
             self._energy,
         )
         return {
-            "f": [_round_finite(pair, 4) for pair in self._forces],
+            "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
             "contact": bool(in_contact),
-            "energy": _round_finite(self._energy, 5),
-            "words": list(dict.fromkeys(self._find_warnings(rows, inputs, zeros))),
+            "energy": _rounded_or_zero(self._energy, 5),
+            "words": list(dict.fromkeys(self._present_warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
-            "tool": _round_finite(self._last_row[1:], 5),
-            "stylus": _round_finite(rows["pose_master"][-1, 4:], 5),
+            "tool": _rounded_or_zero(self._last_row[1:], 5),
+            "stylus": _rounded_or_zero(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _find_warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
+    def _present_warnings(
+        self, rows: dict[str, Array], inputs: Inputs, zeros: Array
+    ) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -135,5 +139,5 @@ class Cockpit:
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 
-def _round_finite(values: Array, digits: int) -> list[float]:
+def _rounded_or_zero(values: Array, digits: int) -> list[float]:
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

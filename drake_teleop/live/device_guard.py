@@ -62,7 +62,7 @@ class DeviceGuard:
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._timeout_fraction(age, period)
+        share = self._allowed_force_fraction(age, period)
         force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -76,7 +76,7 @@ class DeviceGuard:
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
-    def _timeout_fraction(self, age: float, period: float) -> float:
+    def _allowed_force_fraction(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:

@@ -183,7 +183,7 @@ class Live:
         if "rates" in message:
             self._requested = self._rates.set_rates(message["rates"], self._requested, now)
         if "slow" in message:
-            self.pace.slow = message["slow"]
+            self.pace.slowdown = message["slow"]
             self.pace.restart(now)
         if "pause" in message and message["pause"] != self._paused:
             self._paused = message["pause"]
@@ -303,10 +303,10 @@ class Live:
             "words": words,
             "device": "" if self._link is None else self._link.status_text(),
             "speed": round(self.pace.real_time_factor, 4),
-            "slow": self.pace.slow,
-            "factor": round(self.pace.real_time_factor * self.pace.slow, 3),
+            "slow": self.pace.slowdown,
+            "factor": round(self.pace.real_time_factor * self.pace.slowdown, 3),
             "late": round(1e3 * self.pace.lateness_p99_s(), 1),
-            "lost": round(self.pace.given_up, 2),
+            "lost": round(self.pace.lost_time_s, 2),
             "state": self._state_name(),
             "driver": self._driver,
             "drive": self._drives,

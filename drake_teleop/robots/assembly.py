@@ -252,7 +252,7 @@ class MotionWindow:
             self._size = self._weights.shape[1]
             self.reset()
 
-    def add_part(self, part: Part, now: float) -> list[tuple[float, Array]]:
+    def motions_completed_by(self, part: Part, now: float) -> list[tuple[float, Array]]:
         """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
         row = self._row_of_valid_part(part)
         if row is None:
@@ -381,7 +381,7 @@ class Assembly:
             shift = -self.delay_s
             if self._parts.two_clocks:
                 shift += self._clocks[1].offset - self._clocks[0].offset
-            for t, motion in self._window.add_part(part, now):
+            for t, motion in self._window.motions_completed_by(part, now):
                 self._store_motion(t + shift, motion)
         found = []
         while self._pending and (reading := self._complete_reading(self._pending[0])) is not None:

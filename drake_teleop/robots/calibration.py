@@ -197,12 +197,12 @@ def _candidate_information_matrices(
 DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _READ_TIMEOUT_S = 0.05
-_T = TypeVar("_T")
+_SampleT = TypeVar("_SampleT")
 
 
 def calibrate(
-    source: Source[_T],
-    recorder: SampleRecorder[_T],
+    source: Source[_SampleT],
+    recorder: SampleRecorder[_SampleT],
     path: Path,
     tolerance: Tolerance,
     *,

@@ -136,7 +136,7 @@ class TableSink:
     def _write_rows(self) -> None:
         import polars as pl
 
-        rows, table = len(self._rows), pl.DataFrame(self._columns())
+        rows, table = len(self._rows), pl.DataFrame(self._buffered_columns())
         if not self._written:
             remove_log(self._path)
         if self._path.suffix == ".parquet":
@@ -155,7 +155,7 @@ class TableSink:
         del self._rows[:rows]
         self._due = time.monotonic() + self._period
 
-    def _columns(self) -> dict[str, np.ndarray]:
+    def _buffered_columns(self) -> dict[str, np.ndarray]:
         rows = self._rows
         columns = {
             "t": np.array([row.t for row in rows], float),

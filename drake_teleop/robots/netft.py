@@ -26,7 +26,7 @@ START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
 _SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
 _REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
-_MAX_RECORDS = 256  # records per call
+_MAX_RECORDS_PER_CALL = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
 _SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
@@ -79,7 +79,7 @@ class NetFtSource:
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
         try:
-            while len(found) < _MAX_RECORDS:
+            while len(found) < _MAX_RECORDS_PER_CALL:
                 packet = self._socket.recv(RECORD_FORMAT.size + 1)
                 found.append(self.part_of_packet(packet, time.monotonic()))
                 self._socket.settimeout(0.0)

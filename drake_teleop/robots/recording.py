@@ -38,10 +38,10 @@ _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
 _QUATERNION_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
 _NEW_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
-_T = TypeVar("_T")
+_SampleT = TypeVar("_SampleT")
 
 
-class SampleRecorder(ABC, Generic[_T]):
+class SampleRecorder(ABC, Generic[_SampleT]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
     If the source's clock is set, a new record starts; the longest one is written.
@@ -90,7 +90,7 @@ class SampleRecorder(ABC, Generic[_T]):
         return _duration_s(self._longest_part())
 
     @abstractmethod
-    def add(self, sample: _T) -> None:
+    def add(self, sample: _SampleT) -> None:
         """Add a sample if it is valid."""
 
     @abstractmethod

@@ -28,7 +28,7 @@ from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, Compensated, Part,
 
 _NODE_NAME = "drake_teleop"
 _DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
-_MAX_MESSAGES = 256  # queued messages of a stream
+_MAX_QUEUED_MESSAGES = 256  # queued messages of a stream
 _SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
 
 
@@ -125,7 +125,7 @@ class Ros2Source:
         # An executor needs 0.3 ms to find each message; taking those that are there needs 0.02 ms.
         for subscription, receive in self._subscriptions:
             with subscription.handle:
-                for _ in range(_MAX_MESSAGES):
+                for _ in range(_MAX_QUEUED_MESSAGES):
                     taken = subscription.handle.take_message(subscription.msg_type, True)
                     if taken is None:
                         break
@@ -153,7 +153,9 @@ class Ros2Source:
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        best_effort = QoSProfile(depth=_MAX_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
+        best_effort = QoSProfile(
+            depth=_MAX_QUEUED_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT
+        )
         options = {"callback": receive, "qos_profile": best_effort, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 

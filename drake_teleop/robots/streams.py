@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-_T = TypeVar("_T")
+_SampleT = TypeVar("_SampleT")
 NUM_VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
@@ -89,7 +89,7 @@ DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DA
 """Part for invalid packets."""
 
 
-class Source(Protocol[_T]):
+class Source(Protocol[_SampleT]):
     """Interface of a source of readings, or of other samples.
 
     Attributes:
@@ -100,7 +100,7 @@ class Source(Protocol[_T]):
     dt: float
     live: bool
 
-    def read(self, timeout_s: float) -> list[_T] | None:
+    def read(self, timeout_s: float) -> list[_SampleT] | None:
         """Return the samples after waiting for the first; [] after the timeout, None at the end."""
 
     def close(self) -> None:

@@ -28,8 +28,8 @@ POSED_FORMAT = struct.Struct("<4sIQd13d")
 WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEADER_FORMAT = struct.Struct("<4sIQd")
-_MAX_PACKETS = 256  # packets per call
-_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
+_MAX_PACKETS_PER_CALL = 256  # packets per call
+_SOCKET_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
 _SATURATED_FLAG = int(ReadingFlag.SATURATED)
 
 
@@ -107,7 +107,7 @@ class _PacketReceiver:
         self.dt = dt
         self._socket = open_udp_receiver(*host_and_port(address))
         self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
@@ -116,7 +116,7 @@ class _PacketReceiver:
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
-                while len(found) < _MAX_PACKETS:
+                while len(found) < _MAX_PACKETS_PER_CALL:
                     found.append(self._socket.recv(READING_FORMAT.size + 1))
         return found
 

@@ -156,7 +156,7 @@ class StreamContactDetector:
 
     def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
-        touched = _detect_contact(
+        touched = _filter_and_detect_contact(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(ReadingFlag.IN_CONTACT) if touched else 0
@@ -173,7 +173,7 @@ def _filter_motion_into(values, fast, slow, filters, out):
 
 
 @njit(cache=True)
-def _detect_contact(memory, values, contact, fast, slow, filters, settings):
+def _filter_and_detect_contact(memory, values, contact, fast, slow, filters, settings):
     filtered = np.empty(12)
     _filter_motion_into(values, fast, slow, filters, filtered)
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]

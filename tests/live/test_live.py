@@ -278,13 +278,13 @@ def test_short_delays_are_caught_up_and_long_ones_given_up():
         0.0, abs=1e-12
     )
     pace.begin_slice(0.09)  # 40 ms late: the next ones are due at once
-    assert pace.time_to_next_slice(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
+    assert pace.time_to_next_slice(0.09) == pytest.approx(-0.035) and pace.lost_time_s == 0.0
     pace.begin_slice(0.3)
-    assert pace.given_up == pytest.approx(0.245) and pace.time_to_next_slice(0.3) == pytest.approx(
-        5e-3
-    )
+    assert pace.lost_time_s == pytest.approx(0.245) and pace.time_to_next_slice(
+        0.3
+    ) == pytest.approx(5e-3)
     assert pace.real_time_factor < 0.2 and pace.lateness_p99_s() == pytest.approx(0.245)
-    pace.slow = 4.0
+    pace.slowdown = 4.0
     pace.begin_slice(0.305)
     assert pace.time_to_next_slice(0.305) == pytest.approx(0.02)
 

@@ -214,7 +214,7 @@ class GuidedExperiment:
         result = self._apparatus.interval_result(
             self._procedure.current_level, self._stimulus, self._rows
         )
-        result = dataclasses.replace(result, lost_s=live.pace.given_up)
+        result = dataclasses.replace(result, lost_s=live.pace.lost_time_s)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
         self._prepare_interval_if_changed(now)

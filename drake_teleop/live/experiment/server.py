@@ -52,7 +52,7 @@ class ExperimentDrive(LiveDrive):
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
         return GuidedExperiment(*setup, time.perf_counter(), link)
 
-    def count_done_trials(self) -> tuple[int, int]:
+    def done_and_all_trials(self) -> tuple[int, int]:
         """Return the numbers of finished trials and of all trials."""
         return self._procedure.trial_number, len(self._procedure.trials)
 
@@ -81,7 +81,7 @@ def serve_experiment(
         f"participant {participant} at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it",
         flush=True,
     )
-    reason, (done, trials) = live.wait_for_signal(), live.count_done_trials()
+    reason, (done, trials) = live.wait_for_signal(), live.done_and_all_trials()
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(
