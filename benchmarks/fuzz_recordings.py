@@ -38,7 +38,7 @@ from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
 from drake_teleop.live.record import Record, versions_and_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import ReadingRecorder
-from drake_teleop.robots.streams import Compensated, Reading
+from drake_teleop.robots.streams import CompensatedWrench, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
@@ -257,7 +257,7 @@ def full_disk(path: Path) -> None:
         sink = lines.TableSink(file)
         try:
             for k in range(rows):
-                sink.write(Compensated(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
+                sink.write(CompensatedWrench(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
             sink.close()
         except DrakeTeleopError:
             if file.exists():

@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import Assembly, PartStreams
+from drake_teleop.robots.assembly import PartStreams, ReadingAssembler
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
 from drake_teleop.robots.ros2_messages import MESSAGE_TYPES
@@ -106,7 +106,7 @@ def netft_wrenches(path: Path) -> None:
             yield Part(IMU, k, DT * k, still)
             yield source.part_of_packet(packet, DT * k)
 
-    _checked(Assembly(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
@@ -120,7 +120,7 @@ def rtde_wrenches(path: Path) -> None:
     parts = (
         part for each in whole for part in parts_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
     )
-    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), parts)
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), parts)
 
 
 _SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPES}
@@ -134,14 +134,14 @@ def ros_wrenches(path: Path) -> None:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
             parts += _MESSAGES.parts_of_cdr(name, message[:-_SENT], message[-_SENT:])
-    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), iter(parts))
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:
     return [content[k : k + size] for k in range(0, len(content), size)]
 
 
-def _checked(assembly: Assembly, parts: Iterator[Part]) -> None:
+def _checked(assembly: ReadingAssembler, parts: Iterator[Part]) -> None:
     compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
     for k, part in enumerate(parts):
         found: list[Reading] = assembly.readings_completed_by(part, DT * k / 3)

@@ -531,7 +531,7 @@ def export(
         notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
         text = ""
     else:
-        from drake_teleop.robots.export import export_text as export_load
+        from drake_teleop.robots.export import export_load
 
         text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:

@@ -64,7 +64,7 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
         before[1:] = p_WS
 
 
-class Cockpit:
+class PageValueCalculator:
     """Calculator of the page's values from rows of the log."""
 
     def __init__(self, scenario: Scenario) -> None:

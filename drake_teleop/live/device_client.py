@@ -38,7 +38,7 @@ _CLIENT_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
 _MAX_STORED_DELAYS = 100_000  # ticks
 
 
-class Device(Protocol):
+class HapticDevice(Protocol):
     """Interface of a haptic device."""
 
     @property
@@ -60,7 +60,7 @@ class DeviceClient:
     `force_ages_s` contains the delays [s] from each device position to the force that answers it.
     """
 
-    def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
+    def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
         self.force_ages_s: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
         self._device, self._number = device, 0
@@ -151,7 +151,7 @@ class RealTimeVirtualDevice:
     def close(self) -> None: ...
 
 
-def open_device(address: str, grip: str, depth: float) -> Device:
+def open_device(address: str, grip: str, depth: float) -> HapticDevice:
     """Return the device at `virtual` (tapping `depth` [m] deep) or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import POSE_PERIOD_MS
 from drake_teleop.live.inputs import (
@@ -110,7 +110,7 @@ class Live:
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
-        self._cockpit, self.stopped = Cockpit(self._scenario), ""
+        self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()

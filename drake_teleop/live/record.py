@@ -41,7 +41,7 @@ def versions_and_digest(scenario: Scenario) -> dict[str, str]:
     return versions | {"files": digest.hexdigest()[:12]}
 
 
-class Record:
+class SessionRecord:
     """Writer of scenario, load and inputs of a live session into a folder."""
 
     def __init__(

@@ -37,7 +37,7 @@ from drake_teleop.common.files import make_folder
 from drake_teleop.common.html import content_security_policy
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceConnection
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
 from drake_teleop.live.pace import without_garbage_collection
@@ -352,7 +352,7 @@ def compile_session_functions(
     scenario: Scenario, load: IdentifiedLoad | None, device: bool
 ) -> None:
     """Compile the functions of the first simulation slices, which takes a minute once."""
-    session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
+    session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.page_values(session.new_rows(), session.inputs)
         session.apply_inputs(session.inputs.with_changes({"z": z}))

@@ -26,7 +26,7 @@ from drake_teleop.live.record import (
     LOAD_FILE,
     SCENARIO_FILE,
     BackgroundLog,
-    Record,
+    SessionRecord,
     versions_and_digest,
 )
 from drake_teleop.live.scenarios import (
@@ -202,9 +202,9 @@ class Session:
         self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
         self._station = _Station(scenario, estimate, load, 0, device=device)
-        self._record: Record | None = None
+        self._record: SessionRecord | None = None
         if record is not None:
-            self._record = Record(record, scenario, load, self.inputs, device=device)
+            self._record = SessionRecord(record, scenario, load, self.inputs, device=device)
         self._on_disk: BackgroundLog | None = None
         if log is not None:
             self._on_disk = BackgroundLog(log, self._station.simulator, 0.0, add_missing_signals)

@@ -322,7 +322,7 @@ class _ClockOffset:
             self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 
-class Assembly:
+class ReadingAssembler:
     """Source of readings: wrenches with the motion of another stream at the same time.
 
     Args:

@@ -35,7 +35,7 @@ from drake_teleop.robots.compensation_step import (
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
     NUM_VALUES,
-    Compensated,
+    CompensatedWrench,
     Reading,
     ReadingFlag,
 )
@@ -186,7 +186,7 @@ class Compensator:
             raise weight_scale_error("load")
         set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
-    def step(self, reading: Reading, now: float) -> Compensated:
+    def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
         flags = self._reading_flags(reading, now)
         invalid = flags & ~_NONZERO_WRENCH_FLAGS
@@ -206,9 +206,9 @@ class Compensator:
         wrench = self._delay_line[0].copy()
         if clip_wrenches(wrench, self._range):
             flags |= _CLIPPED
-        return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
+        return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
-    def stale_output(self, now: float) -> Compensated | None:
+    def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
         if now - self._now <= STALE_AGE_S:
             return None
@@ -314,6 +314,8 @@ class Compensator:
         self.good_readings_in_row += 1
         return out
 
-    def _zero_output(self, flags: int) -> Compensated:
+    def _zero_output(self, flags: int) -> CompensatedWrench:
         self.good_readings_in_row = 0
-        return Compensated(max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags))
+        return CompensatedWrench(
+            max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags)
+        )

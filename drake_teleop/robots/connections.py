@@ -15,12 +15,12 @@ from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
     ArmKinematics,
-    Assembly,
     PartStreams,
     PoseSourceFromJoints,
+    ReadingAssembler,
     pose_from_rpy,
 )
-from drake_teleop.robots.lines import LineSink, LineSource, TableSink
+from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import PartRecorder, ReadingRecorder, SampleRecorder
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
@@ -59,7 +59,7 @@ def open_source(
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
         parts = _open_parts(address, rate_hz, motion, arm)
-        return Assembly(
+        return ReadingAssembler(
             parts,
             cutoff_hz=cutoff_hz,
             delay_s=delay,
@@ -225,7 +225,7 @@ def _open_mcap_sink(address: str) -> Sink:
 
 
 SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
-    "source", {"udp": UdpSource, "-": lambda address, dt: LineSource(sys.stdin.fileno(), dt)}
+    "source", {"udp": UdpSource, "-": lambda address, dt: JsonLineSource(sys.stdin.fileno(), dt)}
 )
 """Sources of readings by the scheme of their address, called with address and period [s]."""
 PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource]] = Registry(
@@ -242,7 +242,7 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
 SINKS: Registry[Callable[[str], Sink]] = Registry(
     "sink",
     {
-        "-": lambda address: LineSink(sys.stdout),
+        "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
         "zenoh": _open_zenoh_sink,
         "ros2": _open_ros2_sink,

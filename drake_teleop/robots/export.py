@@ -63,7 +63,7 @@ class Format:
     note: str = ""
 
 
-def export_text(
+def export_load(
     found: Identification,
     to: str,
     *,

@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.files import make_folder, wrap_write_errors
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.streams import CompensatedWrench
 from drake_teleop.robots.udp import host_and_port
 
 PORT = 8765
@@ -37,7 +37,7 @@ class _WrenchChannel:
         self.context = foxglove.Context()
         self._channel = foxglove.Channel(TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
 
-    def log_wrench(self, out: Compensated, ns: int | None) -> None:
+    def log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
@@ -63,7 +63,7 @@ class FoxgloveSink:
             raise DrakeTeleopError(str(error), where=address) from error
         self.port = self._server.port
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self._channel.log_wrench(out, None)
 
     def close(self) -> None:
@@ -84,7 +84,7 @@ class McapSink:
                 path, allow_overwrite=True, context=self._channel.context
             )
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self._channel.log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:

@@ -24,7 +24,7 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of_address,
 )
-from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, Compensated, Part, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, CompensatedWrench, Part, ReadingFlag
 
 _NODE_NAME = "drake_teleop"
 _DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
@@ -187,7 +187,7 @@ class Ros2Sink:
         self._diagnostics = node.create_publisher(self._kinds.DiagnosticArray, "/diagnostics", 100)
 
     @delayed_signals()
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         message, ns = self._message, time.time_ns()
         _set_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
@@ -206,7 +206,7 @@ class Ros2Sink:
     def close(self) -> None:
         self._node.close()
 
-    def _diagnostics_message(self, out: Compensated, ns: int) -> Any:
+    def _diagnostics_message(self, out: CompensatedWrench, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
         if out.flags & ~NONZERO_WRENCH_FLAGS:

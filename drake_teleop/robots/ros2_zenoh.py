@@ -24,7 +24,7 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of_address,
 )
-from drake_teleop.robots.streams import Compensated, Part
+from drake_teleop.robots.streams import CompensatedWrench, Part
 
 PORT = 7447
 _NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
@@ -195,7 +195,7 @@ class ZenohSink:
             topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True
         )
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         ns = time.time_ns()
         self._number += 1
         message = self.wrench_message(getattr(out, self._which), ns)

@@ -73,7 +73,7 @@ WRENCH, POSE, IMU, JOINTS = "wrench", "pose", "imu", "joints"
 ACCELERATION = "acceleration"
 
 
-class Compensated(NamedTuple):
+class CompensatedWrench(NamedTuple):
     """Sample for a sink: contact wrench (6,) and scaled wrench (6,) [N, N m]."""
 
     number: int
@@ -121,7 +121,7 @@ class PartSource(Protocol):
 class Sink(Protocol):
     """Interface of a sink of compensated wrenches."""
 
-    def write(self, out: Compensated) -> None: ...
+    def write(self, out: CompensatedWrench) -> None: ...
 
     def close(self) -> None:
         return

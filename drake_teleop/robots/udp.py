@@ -16,7 +16,7 @@ from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
     DAMAGED_WRENCH,
-    Compensated,
+    CompensatedWrench,
     Part,
     Reading,
     ReadingFlag,
@@ -61,12 +61,12 @@ def unpack_parts(packet: bytes) -> list[Part]:
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
-def pack_wrench(out: Compensated) -> bytes:
+def pack_wrench(out: CompensatedWrench) -> bytes:
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
     return _HEADER_FORMAT.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
-def unpack_wrench(packet: bytes) -> Compensated:
+def unpack_wrench(packet: bytes) -> CompensatedWrench:
     if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError(
             f"its {len(packet)} bytes are not a compensated wrench",
@@ -74,7 +74,7 @@ def unpack_wrench(packet: bytes) -> Compensated:
             remedy=f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}",
         )
     _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)
-    return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
+    return CompensatedWrench(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
 def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
@@ -157,7 +157,7 @@ class UdpSink:
         self._to = host_and_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         """Send a wrench; drop it if it cannot be sent now."""
         try:
             self._socket.sendto(pack_wrench(out), self._to)

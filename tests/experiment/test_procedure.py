@@ -20,7 +20,7 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
-from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
 from drake_teleop.live.experiment.store import TrialStore, open_trial_store
 
 SMALL = Experiment(
@@ -210,7 +210,7 @@ def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, h
     experiment = Experiment(tasks=[task], conditions=[Condition(name="a")])
     store = TrialStore(tmp_path)
     go_through(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
-    rows, psi = store.read_rows(1), Psi(low, high)
+    rows, psi = store.read_rows(1), PsiMethod(low, high)
     assert not all(row.correct for row in rows[:3])
     assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]
     psi.update(rows[3].level, bool(rows[3].correct))

@@ -14,7 +14,7 @@ from drake_teleop.common.style import Picture
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, plan_trials
 from drake_teleop.live.experiment.results import (
-    Result,
+    ResultRow,
     _draw_results,
     compute_results,
     write_results,
@@ -55,7 +55,7 @@ def test_folder_contains_table_trials_and_picture(tmp_path):
 def test_axis_of_a_quantity_has_tick_labels(least, most):
     axes = Picture(figsize=(2.9, 2.0)).subplots()
     _draw_results(
-        axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)]
+        axes, ["a"], [ResultRow("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)]
     )
     low, high = axes.get_xlim()
     labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]

@@ -21,7 +21,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
-from drake_teleop.robots.assembly import Assembly, PartStreams, PoseSourceFromJoints
+from drake_teleop.robots.assembly import PartStreams, PoseSourceFromJoints, ReadingAssembler
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
@@ -121,7 +121,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = Assembly(PartStreams(source)), []
+    assembly, found = ReadingAssembler(PartStreams(source)), []
     for k, part in enumerate(sent[1:]):
         found += assembly.readings_completed_by(part, part.t) + assembly.readings_completed_by(
             Part(WRENCH, k, part.t, np.zeros(6)), part.t

@@ -35,7 +35,7 @@ from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,
     WRENCH,
-    Compensated,
+    CompensatedWrench,
     Part,
     Reading,
     ReadingFlag,
@@ -62,7 +62,7 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
             process.kill()
 
 
-class Seen(list[Compensated]):
+class Seen(list[CompensatedWrench]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(
@@ -96,7 +96,7 @@ class Seen(list[Compensated]):
                 if begun and not out.flags and out.number >= last:
                     return
 
-    def _take(self, out: Compensated) -> Compensated:
+    def _take(self, out: CompensatedWrench) -> CompensatedWrench:
         self.append(out)
         self.at.append(time.monotonic())
         return out
@@ -205,7 +205,7 @@ def test_ros_2_node_receives_the_wrench() -> None:
         reader = threading.Thread(target=lambda: seen.extend(lines))
         reader.start()
         while reader.is_alive():
-            sink.write(Compensated(1, 0.0, wrench, -wrench, 0))
+            sink.write(CompensatedWrench(1, 0.0, wrench, -wrench, 0))
             reader.join(0.01)
         sink.close()
     kind = f"geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_{HASH}"
@@ -223,7 +223,7 @@ def test_ros_2_node_receives_the_wrench() -> None:
 
 def test_foxglove_and_mcap(tmp_path: Path) -> None:
     path = tmp_path / "new" / "out.mcap"
-    rows = [Compensated(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
+    rows = [CompensatedWrench(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
     file, live = open_sink(str(path)), open_sink("foxglove://127.0.0.1:0")
     with connect(f"ws://127.0.0.1:{live.port}", subprotocols=["foxglove.sdk.v1"]) as page:
         page.recv()

@@ -27,7 +27,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import MessageConverter
-from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, Compensated, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, CompensatedWrench, ReadingFlag
 
 PEER = Path(__file__).with_name("ros2_peer.py")
 DOMAIN = str(os.getpid() % 100 + 1)
@@ -75,7 +75,7 @@ def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
 
         def write(flags: int) -> None:
             zero = flags & ~NONZERO_WRENCH_FLAGS
-            sink.write(Compensated(7, 0.5, wrench * (not zero), -wrench, flags))
+            sink.write(CompensatedWrench(7, 0.5, wrench * (not zero), -wrench, flags))
 
         seen.wait(lambda: any("wrench" in row for row in seen), lambda: write(0))
         seen.wait(lambda: any(row.get("message") == "ok" for row in seen), lambda: write(0), 30)

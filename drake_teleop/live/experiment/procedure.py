@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.live.experiment.design import ContactDetection, Experiment, PegInSlot, Task
-from drake_teleop.live.experiment.psychometrics import Psi
+from drake_teleop.live.experiment.psychometrics import PsiMethod
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
 #: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
@@ -19,7 +19,7 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlannedTrial:
     """Planned trial; `signal_interval` (1 or 2) has the stimulus; 0 for the peg task."""
 
     task: int
@@ -48,7 +48,7 @@ class IntervalResult:
     lost_s: float = 0.0
 
 
-def plan_trials(experiment: Experiment, participant: int) -> list[Trial]:
+def plan_trials(experiment: Experiment, participant: int) -> list[PlannedTrial]:
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -61,7 +61,7 @@ def plan_trials(experiment: Experiment, participant: int) -> list[Trial]:
         for condition, is_practice in order:
             signal = int(rng.integers(1, 3))
             signal = 0 if isinstance(task, PegInSlot) else signal
-            trials.append(Trial(index, condition, is_practice, signal))
+            trials.append(PlannedTrial(index, condition, is_practice, signal))
     return trials
 
 
@@ -80,7 +80,7 @@ class Procedure:
         self.trials = plan_trials(experiment, participant)
         self._rows = store.read_rows(participant)
         self._psi = {
-            (t, c): Psi(task.low, task.high)
+            (t, c): PsiMethod(task.low, task.high)
             for t, task in enumerate(experiment.tasks)
             if not isinstance(task, PegInSlot)
             for c in range(len(experiment.conditions))
@@ -97,7 +97,7 @@ class Procedure:
         return len(self._rows)
 
     @property
-    def trial(self) -> Trial:
+    def trial(self) -> PlannedTrial:
         return self.trials[min(self.trial_number, len(self.trials) - 1)]
 
     @property
@@ -186,7 +186,7 @@ class Procedure:
         else:
             self._start_next_trial()
 
-    def _update_estimates(self, trial: Trial, row: TrialRow) -> None:
+    def _update_estimates(self, trial: PlannedTrial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
