@@ -148,7 +148,7 @@ def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, 
 
 def python_ns(rows: Array) -> float:
     """ns per reading of the compiled Python kernel: best of three."""
-    s = TARGET.make_compensator().settings
+    s = TARGET.make_compensator().c_settings
     scales = np.array([1.2, 1.2, 1.3, -0.9])
     best = np.inf
     for _ in range(4):

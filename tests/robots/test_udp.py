@@ -202,11 +202,11 @@ import sys, time
 import numpy as np
 from pathlib import Path
 from drake_teleop.robots import lines
-from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.streams import CompensatedWrench
 lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.02)
 sink = lines.TableSink(Path(sys.argv[1]))
 for k in range(10**6):
-    sink.write(Compensated(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
+    sink.write(CompensatedWrench(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
     print(k, flush=True)
     time.sleep(1e-3)
 """
