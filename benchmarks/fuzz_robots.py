@@ -16,7 +16,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.assembly import PartStreams, ReadingAssembler
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
-from drake_teleop.robots.ros2_messages import MESSAGE_TYPES
+from drake_teleop.robots.ros2_messages import MESSAGE_TYPE_OF_TOPIC
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
 from drake_teleop.robots.rtde import parts_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
@@ -56,7 +56,9 @@ def samples(_: Path) -> list[bytes]:
 
 def messages(_: Path) -> list[bytes]:
     """Of ROS 2, each with its attachment."""
-    return [b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPES)]
+    return [
+        b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPE_OF_TOPIC)
+    ]
 
 
 def _message(name: str, k: int) -> bytes:
@@ -77,8 +79,8 @@ def _message(name: str, k: int) -> bytes:
         link = kinds["TransformStamped"](header, "tool0", motion)
         message = kinds["TFMessage"]([link])
     else:
-        message = store.types[MESSAGE_TYPES[name]](header, *data[name]())
-    return bytes(store.serialize_cdr(message, MESSAGE_TYPES[name])) + make_attachment(
+        message = store.types[MESSAGE_TYPE_OF_TOPIC[name]](header, *data[name]())
+    return bytes(store.serialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])) + make_attachment(
         k, ns, b"x" * 16
     )
 
@@ -123,7 +125,7 @@ def rtde_wrenches(path: Path) -> None:
     _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), parts)
 
 
-_SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPES}
+_SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPE_OF_TOPIC}
 _MESSAGES = CdrConverter(-1.0, _FRAMES, _JOINTS)
 
 

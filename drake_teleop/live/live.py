@@ -29,7 +29,7 @@ from drake_teleop.live.inputs import (
 )
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.scenarios import SCENES
+from drake_teleop.live.scenarios import SCENE_NAMES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
@@ -84,7 +84,7 @@ class Live:
     ) -> None:
         self._log, self._initial = log, begin or {}
         self._link, self._slice_ms = link, SLICE_MS if link is None else POSE_PERIOD_MS
-        self.refused, self.requested_scene, self.scene = 0, "", SCENES[0]
+        self.refused, self.requested_scene, self.scene = 0, "", SCENE_NAMES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
         self._drives, self._paused, self.stopped = 0, False, ""
@@ -151,7 +151,7 @@ class Live:
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
             "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
-            "scenes": SCENES,
+            "scenes": SCENE_NAMES,
         }
 
     def join(self, client: int, now: float) -> None:
@@ -370,7 +370,7 @@ def parse_message(text: Any) -> dict[str, Any] | None:
         found["pause"] = message["pause"]
     if _is_finite_number(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
-    if isinstance(message.get("scene"), str) and message["scene"] in SCENES:
+    if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
     found |= {name: True for name in ("reset", "drive") if message.get(name) is True}
     return found or None

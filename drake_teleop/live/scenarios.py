@@ -40,7 +40,7 @@ _SCENARIO_OF_SCENE = {
     "wall": "touch",
     "block": "push_block",
 }
-SCENES = ("own", *_SCENARIO_OF_SCENE)
+SCENE_NAMES = ("own", *_SCENARIO_OF_SCENE)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -64,7 +64,7 @@ def with_task_space_device(scenario: Scenario) -> Scenario:
 
 
 def load_scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENES`; `own` is the user's scenario."""
+    """Return the scenario of a scene in `SCENE_NAMES`; `own` is the user's scenario."""
     if name == "own":
         return own
     scenario = LoadScenario(_SCENARIO_OF_SCENE[name])

@@ -42,7 +42,12 @@ from drake_teleop.live.device_link import DeviceConnection
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenarios import SCENES, live_scenario, load_scene, with_task_space_device
+from drake_teleop.live.scenarios import (
+    SCENE_NAMES,
+    live_scenario,
+    load_scene,
+    with_task_space_device,
+)
 from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
@@ -107,11 +112,11 @@ class LiveDrive:
 
     def _make_scenes(self, scenario: Scenario, device: bool, progress: UpdateProgress) -> None:
         self._scene_scenarios: dict[str, Scenario] = {}
-        for name in SCENES:
+        for name in SCENE_NAMES:
             setup = load_scene(name, scenario)
             self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
             self._views[name] = PageScene(name, self._scene_scenarios[name])
-            progress(len(self._views) / (1 + len(SCENES)))
+            progress(len(self._views) / (1 + len(SCENE_NAMES)))
         compile_session_functions(scenario, self._load, device)
         progress(1.0)
 
@@ -180,7 +185,7 @@ class LiveDrive:
             self._ready.set()
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
-        show = self._views[SCENES[0]].frame_part
+        show = self._views[SCENE_NAMES[0]].frame_part
         link = None if self._device is None else self._device.link
         live = Live(scenario, self._load, record, show, time.perf_counter(), link)
         self.recorded = live.recorded

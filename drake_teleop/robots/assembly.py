@@ -32,7 +32,7 @@ from drake_teleop.robots.compensator import (
 from drake_teleop.robots.streams import (
     IMU,
     JOINTS,
-    NUM_VALUES,
+    NUM_READING_VALUES,
     POSE,
     WRENCH,
     Part,
@@ -401,7 +401,7 @@ class ReadingAssembler:
                 motions.popleft()
 
     def _complete_reading(self, part: Part) -> Reading | None:
-        values, flags, motions = np.zeros(NUM_VALUES), part.flags, self._motions
+        values, flags, motions = np.zeros(NUM_READING_VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):
             return Reading(part.number, part.t, values, flags)

@@ -20,7 +20,12 @@ from drake_teleop.logs.causes.instants import S, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
-from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, NUM_VALUES, Reading, ReadingFlag
+from drake_teleop.robots.streams import (
+    NONZERO_WRENCH_FLAGS,
+    NUM_READING_VALUES,
+    Reading,
+    ReadingFlag,
+)
 
 RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
@@ -47,7 +52,7 @@ class ChangeMonitor:
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
-        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_VALUES))
+        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_READING_VALUES))
         self._count, self._last = 0, -math.inf
         self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
         self._executor = ThreadPoolExecutor(1, "changes of a stream")
@@ -162,7 +167,7 @@ def _change_text(cause: Cause) -> str:
 def main() -> None:
     if hasattr(os, "nice"):
         os.nice(_PROCESS_NICENESS)
-    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_VALUES)
+    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_READING_VALUES)
     json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
 
 

@@ -34,7 +34,7 @@ from drake_teleop.robots.compensation_step import (
 )
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
-    NUM_VALUES,
+    NUM_READING_VALUES,
     CompensatedWrench,
     Reading,
     ReadingFlag,
@@ -149,12 +149,12 @@ class Compensator:
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
         self._rate = _RateCheck(dt)
-        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_VALUES + 6))
+        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_READING_VALUES + 6))
         self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
-        reading_problem(np.zeros(NUM_VALUES), self._largest, self._range)
+        reading_problem(np.zeros(NUM_READING_VALUES), self._largest, self._range)
         clip_wrenches(
-            self._contact_and_scaled_wrench(np.zeros(NUM_VALUES), np.zeros(3)), self._range
+            self._contact_and_scaled_wrench(np.zeros(NUM_READING_VALUES), np.zeros(3)), self._range
         )
         self._evaluate_tare()
         self._reset_filters()
@@ -241,12 +241,12 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _evaluate_tare(self) -> tuple[int, Array, Array]:
-        (mean, squares), offsets = np.zeros((2, NUM_VALUES + 6)), self.offsets.copy()
+        (mean, squares), offsets = np.zeros((2, NUM_READING_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)
         count = float(len(self._tare_rows))
         problem = update_tare_offsets(count, mean, squares, self._noise_limit, offsets)
-        return problem, mean[NUM_VALUES:], offsets
+        return problem, mean[NUM_READING_VALUES:], offsets
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags

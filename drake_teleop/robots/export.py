@@ -18,7 +18,7 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
-STANDARD_GRAVITY = 9.80665  #: m/s^2
+STANDARD_GRAVITY_M_S2 = 9.80665  #: m/s^2
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _ft_tools_yaml(load: ExportedLoad) -> str:
 
 
 def _admittance_yaml(load: ExportedLoad) -> str:
-    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
+    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY_M_S2)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
     return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})

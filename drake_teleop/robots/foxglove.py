@@ -13,8 +13,8 @@ from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench
 from drake_teleop.robots.udp import host_and_port
 
-PORT = 8765
-TOPIC = "/wrench"
+DEFAULT_SERVER_PORT = 8765
+WRENCH_TOPIC = "/wrench"
 _WRENCH_SCHEMA = {"type": "object", "properties": {c: {"type": "number"} for c in WRENCH_COLUMNS}}
 _MESSAGE_SCHEMA = {
     "title": "drake_teleop.Wrench",
@@ -35,7 +35,7 @@ class _WrenchChannel:
         import foxglove
 
         self.context = foxglove.Context()
-        self._channel = foxglove.Channel(TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
+        self._channel = foxglove.Channel(WRENCH_TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
 
     def log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
@@ -51,7 +51,7 @@ class FoxgloveSink:
     """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
-        host, port = host_and_port(address, PORT)
+        host, port = host_and_port(address, DEFAULT_SERVER_PORT)
         self._channel = _WrenchChannel(address)
         import foxglove
 

@@ -26,7 +26,7 @@ from drake_teleop.common.files import (
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    NUM_VALUES,
+    NUM_READING_VALUES,
     CompensatedWrench,
     Reading,
     ReadingFlag,
@@ -50,7 +50,7 @@ def reading_of_json_line(line: bytes, number: int) -> Reading:
         flags = int(ReadingFlag.SATURATED) if data.get("saturated") else 0
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return DAMAGED_READING
-    good = values.shape == (NUM_VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
+    good = values.shape == (NUM_READING_VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
     return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED_READING
 
 

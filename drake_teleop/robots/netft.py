@@ -17,9 +17,9 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, WRENCH, Part, ReadingFlag
 
-PORT = 49152
+DEFAULT_UDP_PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
 RECORD_FORMAT = struct.Struct(">III6i")
 START_COMMAND, STOP_COMMAND = 2, 0
@@ -53,7 +53,7 @@ class NetFtSource:
     streams: tuple[str, ...] = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
-        parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
+        parsed = Address(address, DEFAULT_UDP_PORT, allowed=("counts", "rate", "sign"))
         counts, rate = parsed.positive_numbers("counts", 2), parsed.positive_numbers("rate", 1)
         sign = parsed.wrench_sign()
         if rate is None and dt is not None:
@@ -91,7 +91,7 @@ class NetFtSource:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         record = unpack_record(packet)
         if record is None:
-            return DAMAGED_WRENCH
+            return DAMAGED_WRENCH_PART
         # rdt_sequence has 32 bits and wraps around.
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._last_received = now

@@ -18,7 +18,15 @@ from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import PartStreams
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
-from drake_teleop.robots.streams import IMU, NUM_VALUES, POSE, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.streams import (
+    IMU,
+    NUM_READING_VALUES,
+    POSE,
+    WRENCH,
+    Part,
+    Reading,
+    ReadingFlag,
+)
 
 _INVALID_FLAGS = (
     ReadingFlag.DAMAGED
@@ -110,7 +118,7 @@ class ReadingRecorder(SampleRecorder[Reading]):
         self._add_sample(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        t, values = self._longest_part()[WRENCH].times_and_values(NUM_VALUES, self.left_out)
+        t, values = self._longest_part()[WRENCH].times_and_values(NUM_READING_VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 

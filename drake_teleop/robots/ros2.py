@@ -15,7 +15,7 @@ from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import (
-    MESSAGE_TYPES,
+    MESSAGE_TYPE_OF_TOPIC,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
@@ -97,7 +97,7 @@ class Ros2Source:
         parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
-        classes = {name: message_class(MESSAGE_TYPES[name], address) for name in topics}
+        classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
         self._found: list[Part] = []
         self._counts: Counter[str] = Counter()

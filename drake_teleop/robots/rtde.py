@@ -17,7 +17,7 @@ from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
-PORT = 30004
+RTDE_PORT = 30004
 _START_TIMEOUT_S = 10.0  # wait for the robot at the start
 _MIN_RESTART_PERIOD_S = 0.2  # between two starts of the child
 _RATE_MEASUREMENT_SAMPLES = 5  # samples for the rate
@@ -30,8 +30,8 @@ class RtdeSource:
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 
     def __init__(self, address: str) -> None:
-        parsed = Address(address, PORT, allowed=("sign",))
-        if parsed.port != PORT:
+        parsed = Address(address, RTDE_PORT, allowed=("sign",))
+        if parsed.port != RTDE_PORT:
             raise DrakeTeleopError(
                 "RTDE always uses port 30004", where=address, remedy="remove the port"
             )

@@ -13,7 +13,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 
 _SampleT = TypeVar("_SampleT")
-NUM_VALUES = 15
+NUM_READING_VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
 
@@ -83,9 +83,9 @@ class CompensatedWrench(NamedTuple):
     flags: int
 
 
-DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_VALUES, np.nan), int(ReadingFlag.DAMAGED))
+DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_READING_VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
-DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
+DAMAGED_WRENCH_PART = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
 """Part for invalid packets."""
 
 

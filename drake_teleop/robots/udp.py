@@ -15,7 +15,7 @@ from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    DAMAGED_WRENCH,
+    DAMAGED_WRENCH_PART,
     CompensatedWrench,
     Part,
     Reading,
@@ -54,7 +54,7 @@ def pack_parts(wrench: Part, pose: Part) -> bytes:
 
 def unpack_parts(packet: bytes) -> list[Part]:
     if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
-        return [DAMAGED_WRENCH]
+        return [DAMAGED_WRENCH_PART]
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
     wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED_FLAG)

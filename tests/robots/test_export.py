@@ -17,7 +17,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY, export_load
+from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY_M_S2, export_load
 
 MASS, COM = 1.7, np.array([0.012, -0.034, 0.091])
 INERTIA = np.array([[4.1e-3, 3e-4, -2e-4], [3e-4, 5.2e-3, 1e-4], [-2e-4, 1e-4, 3.3e-3]])
@@ -103,7 +103,7 @@ def by_ft_tools(text: str) -> Values:
 def by_admittance(text: str) -> Values:
     told = yaml.safe_load(text)["admittance_controller"]["ros__parameters"]
     centre = told["gravity_compensation"]["CoG"]
-    return centre["force"] / STANDARD_GRAVITY, centre["pos"], None
+    return centre["force"] / STANDARD_GRAVITY_M_S2, centre["pos"], None
 
 
 def by_bota(text: str) -> Values:

@@ -14,7 +14,7 @@ from drake_teleop.common.files import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
-from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
+from drake_teleop.live.experiment.procedure import GAP_PHASE, INTERVAL_PHASE, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
@@ -151,7 +151,7 @@ class GuidedExperiment:
         if client != self._driver:
             return
         procedure = self._procedure
-        if procedure.phase == INTERVAL:
+        if procedure.phase == INTERVAL_PHASE:
             moves = {kind: message[kind] for kind in message.keys() & {"set", "rates"}}
             self._live.handle_message(client, json.dumps(moves), now)
         before = procedure.phase, procedure.trial_number
@@ -164,7 +164,7 @@ class GuidedExperiment:
             return
         self._prepare_interval_if_changed(now)
         self._since = now
-        if procedure.phase == INTERVAL:
+        if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
 
     def time_to_next_tick(self, now: float) -> float:
@@ -186,13 +186,13 @@ class GuidedExperiment:
 
     @property
     def _is_interval_running(self) -> bool:
-        return self._procedure.phase == INTERVAL and self._driver is not None
+        return self._procedure.phase == INTERVAL_PHASE and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP and now - self._since >= _INTERVAL_PAUSE_S:
+        if self._procedure.phase == GAP_PHASE and now - self._since >= _INTERVAL_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:

@@ -11,8 +11,18 @@ from drake_teleop.live.experiment.design import ContactDetection, Experiment, Pe
 from drake_teleop.live.experiment.psychometrics import PsiMethod
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
-#: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
-CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
+#: Phases of an experiment; `go` ends each one except gap, interval and answer.
+(
+    CONSENT_PHASE,
+    TASK_PHASE,
+    READY_PHASE,
+    INTERVAL_PHASE,
+    GAP_PHASE,
+    ANSWER_PHASE,
+    FEEDBACK_PHASE,
+    BREAK_PHASE,
+    END_PHASE,
+) = (
     *("consent", "task", "ready", "interval", "gap", "answer"),
     *("told", "break", "end"),
 )
@@ -88,7 +98,7 @@ class Procedure:
         self._pressed: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._update_estimates(trial, row)
-        self.phase, self.is_answer_right, self.is_repeated = CONSENT, False, False
+        self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
         self.prepared_intervals = 0
         self._prepare_trial()
 
@@ -126,13 +136,13 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def advance_phase(self) -> None:
-        if self.phase == CONSENT:
-            self.phase = END if self.trial_number >= len(self.trials) else TASK
-        elif self.phase in (TASK, BREAK):
-            self.phase = READY
-        elif self.phase == READY:
-            self.phase, self.is_repeated = INTERVAL, False
-        elif self.phase == FEEDBACK:
+        if self.phase == CONSENT_PHASE:
+            self.phase = END_PHASE if self.trial_number >= len(self.trials) else TASK_PHASE
+        elif self.phase in (TASK_PHASE, BREAK_PHASE):
+            self.phase = READY_PHASE
+        elif self.phase == READY_PHASE:
+            self.phase, self.is_repeated = INTERVAL_PHASE, False
+        elif self.phase == FEEDBACK_PHASE:
             self._start_next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
@@ -140,26 +150,26 @@ class Procedure:
         self._results[self.interval - 1] = result
         if not result.valid:
             self._prepare_trial()
-            self.phase, self.is_repeated = READY, True
+            self.phase, self.is_repeated = READY_PHASE, True
         elif self.trial.signal_interval == 0:
             self._finish_trial(0, result.done, result.time_s)
         elif self.interval == 1:
-            self.interval, self.phase = 2, GAP
+            self.interval, self.phase = 2, GAP_PHASE
             self.prepared_intervals += 1
         else:
-            self.phase = ANSWER
+            self.phase = ANSWER_PHASE
 
     def start_second_interval(self) -> None:
-        self.phase = INTERVAL
+        self.phase = INTERVAL_PHASE
 
     def restart_trial(self) -> None:
-        if self.phase in (INTERVAL, GAP, ANSWER):
+        if self.phase in (INTERVAL_PHASE, GAP_PHASE, ANSWER_PHASE):
             self._prepare_trial()
-            self.phase = READY
+            self.phase = READY_PHASE
 
     def store_answer(self, interval: int, time_s: float) -> None:
         """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
-        if self.phase == ANSWER:
+        if self.phase == ANSWER_PHASE:
             self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
@@ -182,7 +192,7 @@ class Procedure:
         self._update_estimates(trial, row)
         self.is_answer_right = bool(correct)
         if trial.practice:
-            self.phase = FEEDBACK
+            self.phase = FEEDBACK_PHASE
         else:
             self._start_next_trial()
 
@@ -197,21 +207,21 @@ class Procedure:
     def _start_next_trial(self) -> None:
         before = self.trials[self.trial_number - 1]
         if self.trial_number == len(self.trials):
-            self.phase = END
+            self.phase = END_PHASE
             return
         self._prepare_trial()
         practised = before.practice and not self.trial.practice
         if self.trial.task != before.task:
-            self.phase = TASK
+            self.phase = TASK_PHASE
         elif practised or self.trial_number % self.experiment.break_after == 0:
-            self.phase = BREAK
+            self.phase = BREAK_PHASE
         else:
-            self.phase = READY
+            self.phase = READY_PHASE
 
     def page_state(self) -> dict[str, Any]:
         number = self.trial_number - (
-            self.phase == FEEDBACK
-        )  # FEEDBACK belongs to the finished trial
+            self.phase == FEEDBACK_PHASE
+        )  # FEEDBACK_PHASE belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
@@ -222,6 +232,6 @@ class Procedure:
             "practice": trial.practice,
             "interval": self.interval,
             "again": self.is_repeated,
-            "said": self.is_answer_right if self.phase == FEEDBACK else None,
-            "consent": self.experiment.consent if self.phase == CONSENT else "",
+            "said": self.is_answer_right if self.phase == FEEDBACK_PHASE else None,
+            "consent": self.experiment.consent if self.phase == CONSENT_PHASE else "",
         }

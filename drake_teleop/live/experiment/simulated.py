@@ -20,10 +20,10 @@ from drake_teleop.live.experiment.design import (
     SimulatedParticipant,
 )
 from drake_teleop.live.experiment.procedure import (
-    ANSWER,
-    END,
-    GAP,
-    INTERVAL,
+    ANSWER_PHASE,
+    END_PHASE,
+    GAP_PHASE,
+    INTERVAL_PHASE,
     IntervalResult,
     Procedure,
 )
@@ -70,8 +70,8 @@ def simulate_participant(
     """Run the remaining trials; `progress` receives the numbers of finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
-    while procedure.phase != END:
-        if procedure.phase == INTERVAL:
+    while procedure.phase != END_PHASE:
+        if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
                 result = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
@@ -79,9 +79,9 @@ def simulate_participant(
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
             procedure.finish_interval(result)
-        elif procedure.phase == GAP:
+        elif procedure.phase == GAP_PHASE:
             procedure.start_second_interval()
-        elif procedure.phase == ANSWER:
+        elif procedure.phase == ANSWER_PHASE:
             rng = np.random.default_rng([experiment.seed, participant, procedure.trial_number, 3])
             procedure.store_answer(compare_responses(observer, responses, rng), 0.5)
             progress(procedure.trial_number, len(procedure.trials))

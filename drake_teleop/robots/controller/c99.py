@@ -19,7 +19,7 @@ from drake_teleop.logs.causal import design_low_pass
 from drake_teleop.robots import compensation_step as step
 from drake_teleop.robots.compensator import STALE_AGE_S, Compensator
 from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
-from drake_teleop.robots.streams import NUM_VALUES, Reading
+from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
@@ -39,7 +39,7 @@ Files = Mapping[str, str | bytes]
 @cache
 def c_kernel_text() -> str:
     c = Translator()
-    values, row, out = (NUM_VALUES,), (NUM_VALUES + 6,), (12,)
+    values, row, out = (NUM_READING_VALUES,), (NUM_READING_VALUES + 6,), (12,)
     c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
     c.translate_function(
         step.set_scale_factors_into,
@@ -162,7 +162,7 @@ def _test_vector_header(target: ControllerTarget) -> str:
     inputs, largest = _simulated_readings(target)
     python = target.make_compensator(largest, **_TEST_SCALES)
     outputs = [
-        python.step(Reading(k, t, row[:NUM_VALUES], gravity=row[NUM_VALUES:]), t)
+        python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
