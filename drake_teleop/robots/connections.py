@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -176,52 +177,9 @@ def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 
-def _open_rtde_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.rtde import RtdeSource
-
-    return RtdeSource(address)
-
-
-def _open_netft_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.netft import NetFtSource
-
-    return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
-
-
-def _open_zenoh_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.ros2_zenoh import ZenohSource
-
-    return ZenohSource(address, _require_period_s(rate_hz, address), joints)
-
-
-def _open_ros2_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.ros2 import Ros2Source
-
-    return Ros2Source(address, _require_period_s(rate_hz, address), joints)
-
-
-def _open_zenoh_sink(address: str) -> Sink:
-    from drake_teleop.robots.ros2_zenoh import ZenohSink
-
-    return ZenohSink(address)
-
-
-def _open_ros2_sink(address: str) -> Sink:
-    from drake_teleop.robots.ros2 import Ros2Sink
-
-    return Ros2Sink(address)
-
-
-def _open_foxglove_sink(address: str) -> Sink:
-    from drake_teleop.robots.foxglove import FoxgloveSink
-
-    return FoxgloveSink(address)
-
-
-def _open_mcap_sink(address: str) -> Sink:
-    from drake_teleop.robots.foxglove import McapSink
-
-    return McapSink(Path(address))
+def _make_stream(module: str, class_name: str, *arguments: Any) -> Any:
+    """Return an instance of a class in a module of `robots`, whose libraries are optional."""
+    return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
 
 SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
@@ -232,10 +190,16 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
     "source of parts",
     {
         "posed": lambda address, hz, joints: PosedSource(address, _require_period_s(hz, address)),
-        "rtde": _open_rtde_source,
-        "netft": _open_netft_source,
-        "zenoh": _open_zenoh_source,
-        "ros2": _open_ros2_source,
+        "rtde": lambda address, hz, joints: _make_stream("rtde", "RtdeSource", address),
+        "netft": lambda address, hz, joints: _make_stream(
+            "netft", "NetFtSource", address, None if hz is None else 1.0 / hz
+        ),
+        "zenoh": lambda address, hz, joints: _make_stream(
+            "ros2_zenoh", "ZenohSource", address, _require_period_s(hz, address), joints
+        ),
+        "ros2": lambda address, hz, joints: _make_stream(
+            "ros2", "Ros2Source", address, _require_period_s(hz, address), joints
+        ),
     },
 )
 """Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
@@ -244,12 +208,12 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": _open_zenoh_sink,
-        "ros2": _open_ros2_sink,
-        "foxglove": _open_foxglove_sink,
+        "zenoh": lambda address: _make_stream("ros2_zenoh", "ZenohSink", address),
+        "ros2": lambda address: _make_stream("ros2", "Ros2Sink", address),
+        "foxglove": lambda address: _make_stream("foxglove", "FoxgloveSink", address),
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": _open_mcap_sink,
+        ".mcap": lambda address: _make_stream("foxglove", "McapSink", Path(address)),
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""
