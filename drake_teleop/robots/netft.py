@@ -10,7 +10,6 @@ import socket
 import struct
 import time
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, WRENCH, Part, Readi
 DEFAULT_UDP_PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
 RECORD_FORMAT = struct.Struct(">III6i")
+"""RDT sequence, F/T sequence, status, and the wrench in counts."""
 START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
 _SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
@@ -29,22 +29,6 @@ _REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
 _MAX_RECORDS_PER_CALL = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
 _SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
-
-
-class RdtRecord(NamedTuple):
-    """Record of the RDT protocol, with the wrench in counts."""
-
-    rdt_sequence: int
-    ft_sequence: int
-    status: int
-    counts: tuple[int, ...]
-
-
-def unpack_record(packet: bytes) -> RdtRecord | None:
-    if len(packet) != RECORD_FORMAT.size:
-        return None
-    rdt, ft, status, *counts = RECORD_FORMAT.unpack(packet)
-    return RdtRecord(rdt, ft, status, tuple(counts))
 
 
 class NetFtSource:
@@ -89,23 +73,23 @@ class NetFtSource:
 
     def part_of_packet(self, packet: bytes, now: float) -> Part:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
-        record = unpack_record(packet)
-        if record is None:
+        if len(packet) != RECORD_FORMAT.size:
             return DAMAGED_WRENCH_PART
+        rdt_sequence, ft_sequence, status, *counts = RECORD_FORMAT.unpack(packet)
         # rdt_sequence has 32 bits and wraps around.
-        self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
+        self._number += (rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._last_received = now
         flags = 0
-        if record.status & _SATURATED_STATUS_BIT:
+        if status & _SATURATED_STATUS_BIT:
             flags = int(ReadingFlag.SATURATED)
-        elif record.status & _ERROR_STATUS_BIT:
+        elif status & _ERROR_STATUS_BIT:
             flags = int(ReadingFlag.DAMAGED)
-        if record.ft_sequence != self._measured:
-            self._measured, self._measured_at = record.ft_sequence, now
+        if ft_sequence != self._measured:
+            self._measured, self._measured_at = ft_sequence, now
         elif now - self._measured_at > _MAX_UNCHANGED_WRENCH_S:
             flags |= int(ReadingFlag.STALE)
         t = self._pace.time_of_sample(self._number, now)
-        return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
+        return Part(WRENCH, self._number, t, np.array(counts) * self._per_count, flags)
 
     def _request_stream(self) -> None:
         now = time.monotonic()
