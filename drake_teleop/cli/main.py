@@ -579,9 +579,9 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 @cli.command("compare-passivity")
 @click.option(
-    "--networks", type=option.NameList(), help="Network presets.  [default: all but ideal]"
+    "--networks", type=option.NAMES_TYPE, help="Network presets.  [default: all but ideal]"
 )
-@click.option("--methods", type=option.NameList(), help="Passivity methods.  [default: all]")
+@click.option("--methods", type=option.NAMES_TYPE, help="Passivity methods.  [default: all]")
 @click.option(
     "--scenario",
     default="contact_transition",
@@ -614,9 +614,9 @@ def compare_passivity(
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
 @click.option(
-    "--hands", type=option.NameList(), help="Grips of the operator.  [default: light,firm]"
+    "--hands", type=option.NAMES_TYPE, help="Grips of the operator.  [default: light,firm]"
 )
-@click.option("--walls", type=option.NameList(), help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--walls", type=option.NAMES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
@@ -694,7 +694,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 @option.package_paths
 @click.option(
     "--acceleration",
-    type=option.PositiveNumberList(),
+    type=option.POSITIVES_TYPE,
     default=(),
     help="With --model: acceleration limits [rad/s^2], one for all joints or one for each.",
 )

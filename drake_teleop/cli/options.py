@@ -107,17 +107,22 @@ SCALE_TYPE = FiniteNumber(0, 100)
 POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
 
 
-class NameList(click.ParamType):
-    """Parameter type of names separated by commas."""
+class CommaSeparated(click.ParamType):
+    """Parameter type of values of type `item`, separated by commas."""
 
-    name = "NAME,..."
+    def __init__(self, name: str, item: click.ParamType) -> None:
+        self.name, self._item = f"{name},...", item
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
+    ) -> tuple[Any, ...]:
         if isinstance(value, tuple):
             return value
-        return tuple(name.strip() for name in value.split(","))
+        return tuple(self._item.convert(part.strip(), param, ctx) for part in value.split(","))
+
+
+NAMES_TYPE = CommaSeparated("NAME", click.STRING)
+POSITIVES_TYPE = CommaSeparated("number", POSITIVE_TYPE)
 
 
 class RegisteredName(click.Choice):
@@ -135,19 +140,6 @@ class RegisteredName(click.Choice):
 
     @choices.setter
     def choices(self, value: tuple[str, ...]) -> None: ...
-
-
-class PositiveNumberList(click.ParamType):
-    """Parameter type of positive numbers separated by commas."""
-
-    name = "number,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        if isinstance(value, tuple):
-            return value
-        return tuple(POSITIVE_TYPE.convert(part, param, ctx) for part in value.split(","))
 
 
 def output_folder(command: str) -> Callable[[Any], Any]:
