@@ -100,7 +100,8 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
-    if not (inputs.detection and _has_noise_floor(load, inputs)):
+    has_noise_floor = load is not None and load.noise_floor is not None and inputs.sensor == 0
+    if not (inputs.detection and has_noise_floor):
         changes["contact_detection"] = None
     elif scenario.contact_detection is None:
         changes["contact_detection"] = ContactDetectionConfig()
@@ -113,10 +114,6 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         gripper = load.identification.phi - has_payload * _payload_phi(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
-
-
-def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
-    return load is not None and load.noise_floor is not None and inputs.sensor == 0
 
 
 def _payload_phi(scenario: Scenario) -> Array:

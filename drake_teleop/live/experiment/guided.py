@@ -40,12 +40,6 @@ _BLANK_FRAME_VALUES = {
 HAND_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
-def with_zero_wrenches(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return a log's rows with zero wrenches."""
-    none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
-    return rows | {name: np.zeros_like(rows[name]) for name in none}
-
-
 class GuidedExperiment:
     """Event handler of an experiment, with the interface of `Live`; times `now` in s.
 
@@ -98,7 +92,8 @@ class GuidedExperiment:
 
     def _add_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add(rows)
-        return self._show(with_zero_wrenches(rows))
+        hidden = ("measured_wrench_S", "load_estimate")
+        return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
 
     def hello(self) -> dict[str, Any]:
         procedure = self._procedure

@@ -35,7 +35,7 @@ class ExperimentDrive(LiveDrive):
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
         self._stations = make_all_apparatus(experiment, scenarios)
-        self._procedure = Procedure(experiment, participant, store)
+        self.procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
 
@@ -49,12 +49,8 @@ class ExperimentDrive(LiveDrive):
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
         shows = [view.frame_part for view in self._views.values()]
-        setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
+        setup = (self.procedure, self._stations, self._scenarios, self._store, shows)
         return GuidedExperiment(*setup, time.perf_counter(), link)
-
-    def done_and_all_trials(self) -> tuple[int, int]:
-        """Return the numbers of finished trials and of all trials."""
-        return self._procedure.trial_number, len(self._procedure.trials)
 
     def _page_html(self) -> str:
         panel = (
@@ -81,7 +77,8 @@ def serve_experiment(
         f"participant {participant} at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it",
         flush=True,
     )
-    reason, (done, trials) = live.wait_for_signal(), live.done_and_all_trials()
+    reason = live.wait_for_signal()
+    done, trials = live.procedure.trial_number, len(live.procedure.trials)
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(

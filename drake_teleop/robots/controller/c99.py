@@ -78,10 +78,6 @@ def c_kernel_text() -> str:
     return render_template("wrench_compensator.c", kernel=c.text, helpers=C_HELPER_FUNCTIONS)
 
 
-def c_header_text() -> str:
-    return read_template("wrench_compensator.h")
-
-
 class ControllerTarget(NamedTuple):
     """Load, rate, low-pass and sensor of an export.
 
@@ -135,7 +131,13 @@ def kernel_files(target: ControllerTarget) -> Files:
     load = render_template(
         "load.h", dt=repr(target.dt), settings=target.settings_initializer(), notes=target.notes
     )
-    return dict(zip(KERNEL_FILES, (c_header_text(), c_kernel_text(), load), strict=True))
+    return dict(
+        zip(
+            KERNEL_FILES,
+            (read_template("wrench_compensator.h"), c_kernel_text(), load),
+            strict=True,
+        )
+    )
 
 
 def read_template(name: str) -> str:
