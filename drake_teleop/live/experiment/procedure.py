@@ -12,20 +12,9 @@ from drake_teleop.live.experiment.psychometrics import PsiMethod
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
 #: Phases of an experiment; `go` ends each one except gap, interval and answer.
-(
-    CONSENT_PHASE,
-    TASK_PHASE,
-    READY_PHASE,
-    INTERVAL_PHASE,
-    GAP_PHASE,
-    ANSWER_PHASE,
-    FEEDBACK_PHASE,
-    BREAK_PHASE,
-    END_PHASE,
-) = (
-    *("consent", "task", "ready", "interval", "gap", "answer"),
-    *("told", "break", "end"),
-)
+CONSENT_PHASE, TASK_PHASE, READY_PHASE = "consent", "task", "ready"
+INTERVAL_PHASE, GAP_PHASE, ANSWER_PHASE = "interval", "gap", "answer"
+FEEDBACK_PHASE, BREAK_PHASE, END_PHASE = "told", "break", "end"
 
 
 @dataclass(frozen=True)
@@ -219,9 +208,8 @@ class Procedure:
             self.phase = READY_PHASE
 
     def page_state(self) -> dict[str, Any]:
-        number = self.trial_number - (
-            self.phase == FEEDBACK_PHASE
-        )  # FEEDBACK_PHASE belongs to the finished trial
+        # FEEDBACK_PHASE belongs to the finished trial.
+        number = self.trial_number - (self.phase == FEEDBACK_PHASE)
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
