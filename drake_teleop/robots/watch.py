@@ -27,7 +27,7 @@ from drake_teleop.load.online.watched import (
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import low_pass_coefficients
+from drake_teleop.logs.causal import causal_low_pass, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
@@ -121,7 +121,9 @@ class StreamContactDetector:
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
-        rows = self._low_pass_rows(np.hstack([contact, values[:, 6:]]))
+        fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
+        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
+        rows = np.hstack([fast, fast[:, 6:9] - slow_s])
         # Skip the transient of the low-passes.
         settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
@@ -145,15 +147,6 @@ class StreamContactDetector:
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
-    def _low_pass_rows(self, rows: Array) -> Array:
-        filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
-        out = np.empty((len(rows), 18))
-        for row, to in zip(rows, out, strict=True):
-            to[:6] = row[:6]
-            low_pass_into(to[:6], self._fast, contacts)
-            _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
-        return out
-
     def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
         touched = _filter_and_detect_contact(
@@ -163,18 +156,12 @@ class StreamContactDetector:
 
 
 @njit(cache=True)
-def _filter_motion_into(values, fast, slow, filters, out):
-    out[:9] = values[6:]
-    low_pass_into(out[:9], fast, filters[:, :9])
-    out[9:] = values[6:9]
-    low_pass_into(out[9:], slow, filters[:, 9:])
-    for i in range(3):
-        out[9 + i] = out[i] - out[9 + i]
-
-
-@njit(cache=True)
 def _filter_and_detect_contact(memory, values, contact, fast, slow, filters, settings):
     filtered = np.empty(12)
-    _filter_motion_into(values, fast, slow, filters, filtered)
+    filtered[:9], filtered[9:] = values[6:], values[6:9]
+    low_pass_into(filtered[:9], fast, filters[:, :9])
+    low_pass_into(filtered[9:], slow, filters[:, 9:])
+    for i in range(3):
+        filtered[9 + i] = filtered[i] - filtered[9 + i]
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
     return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
