@@ -7,17 +7,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
-
-Array = NDArray[np.float64]
 
 #: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
 MIN_CONTACT_FORCE_N = 2.0

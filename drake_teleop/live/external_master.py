@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import (
@@ -17,6 +16,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     quaternion_exponential,
@@ -32,8 +32,6 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.plant import start_pose
 from drake_teleop.station.wiring import export_outputs
-
-Array = NDArray[np.float64]
 
 #: Period of the poses [s], and [ms].
 POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2

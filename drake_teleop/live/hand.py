@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -17,6 +16,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     add_cross_product,
     conjugate_quaternion,
@@ -39,8 +39,6 @@ from drake_teleop.station.operator.operator import (
 )
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.wiring import export_outputs
-
-Array = NDArray[np.float64]
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import read_text
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_logarithm
 from drake_teleop.common.version import __version__
@@ -21,8 +21,6 @@ from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
-
-Array = NDArray[np.float64]
 
 AS_IN_SCENARIO = "as in the scenario"
 NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")

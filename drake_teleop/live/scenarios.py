@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
@@ -21,8 +21,6 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Payload
-
-Array = NDArray[np.float64]
 
 #: Gripped object, if the scenario has no payload.
 DEFAULT_OBJECT = Payload(mass=0.8)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -20,8 +19,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 #: Blocks whose parameters change during a live session.
 _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")

@@ -6,8 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment.design import (
     ApparentMass,
@@ -24,8 +24,6 @@ from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
-
-Array = NDArray[np.float64]
 
 _MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].

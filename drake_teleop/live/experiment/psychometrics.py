@@ -11,10 +11,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, xlogy
 
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 #: Grid of the uniform prior; thresholds and slopes are uniform in the logarithm.
 _NUM_GRID_THRESHOLDS = 81
