@@ -36,16 +36,6 @@ def smallest_and_largest_norm_into(vectors, origins, out):
 
 
 @njit(cache=True)
-def _joints_at_limit_bits(values, limits):
-    found = 0
-    for row in range(len(values)):
-        for k in range(len(limits)):
-            if abs(values[row, k]) >= limits[k]:
-                found |= 1 << k
-    return found
-
-
-@njit(cache=True)
 def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
@@ -127,9 +117,9 @@ class PageValueCalculator:
         if hand[1] > _HAND_FORCE_LIMIT_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
-            at_limit = _joints_at_limit_bits(rows[name][:, part], limits)
-            if at_limit:
-                joints = [str(k + 1) for k in range(len(limits)) if at_limit >> k & 1]
+            at_limit = (np.abs(rows[name][:, part]) >= limits).any(axis=0)
+            if at_limit.any():
+                joints = [str(k + 1) for k in np.flatnonzero(at_limit)]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
         if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_TIMEOUT_S:
             yield "the network delivers no packets"
