@@ -28,10 +28,6 @@ KERNEL_FILES = ("wrench_compensator.h", "wrench_compensator.c", "load.h")
 _TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_AMPLITUDES = np.repeat([1.0, 0.05], 3)
-_SETTING_NAMES = (
-    *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
-    *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
-)  # in the order of the C structure
 
 Files = Mapping[str, str | bytes]
 
@@ -95,16 +91,11 @@ class ControllerTarget(NamedTuple):
     notes: list[str]
 
     def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
-        """Return the C initializer of a `wrench_compensator_settings`."""
-        loop = self.make_compensator(largest, **scales)
-        values = {
-            "sigma_weight": 0.0,
-            "sigma_inertia": 0.0,
-            "gamma": 1.0,
-            **scales,
-            **loop.c_settings,
-        }
-        return "".join(f"    {_c_literal(values[name])}, /* {name} */\n" for name in _SETTING_NAMES)
+        """Return the C initializer of `wrench_compensator_settings`, in the order of its fields."""
+        others = self.make_compensator(largest, **scales).c_settings
+        values = {name: others.pop(name) for name in ("phi", "offsets")}
+        values |= {"sigma_weight": 0.0, "sigma_inertia": 0.0, "gamma": 1.0, **scales, **others}
+        return "".join(f"    {_c_literal(each)}, /* {name} */\n" for name, each in values.items())
 
     def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
         largest = self.sensor_range if largest is None else largest
