@@ -8,9 +8,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from importlib import import_module
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 from pydrake.systems.analysis import Simulator
 
@@ -113,7 +115,7 @@ class BackgroundLog(LogOnDisk):
     ) -> None:
         super().__init__(folder, simulator, start, form)
         self._thread = ThreadPoolExecutor(1, "log of a drive")
-        self._writing: Future[None] = self._thread.submit(_import_polars)
+        self._writing: Future[Any] = self._thread.submit(import_module, "polars")
 
     def finish(self) -> None:
         self._writing.result()
@@ -121,7 +123,3 @@ class BackgroundLog(LogOnDisk):
     def _write_part(self, part: SimulationResult) -> None:
         self.finish()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
-
-
-def _import_polars() -> None:
-    import polars  # noqa: F401

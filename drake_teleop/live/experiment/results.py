@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import IntervalEstimate, PsiMethod
-from drake_teleop.live.experiment.store import TrialRow, TrialStore
+from drake_teleop.live.experiment.store import TrialRow, TrialStore, table_schema
 
 if TYPE_CHECKING:
     import polars as pl
@@ -108,13 +108,7 @@ def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
     import polars as pl
 
     found = compute_results(experiment, store)
-    schema: dict[str, type[pl.DataType]] = {
-        name: pl.String for name in ("task", "condition", "quantity")
-    }
-    schema |= {name: pl.Int64 for name in ("participant", "trials")}
-    schema |= {name: pl.Float64 for name in ("value", "low", "high")}
-    schema = {name: schema[name] for name in ResultRow._fields}
-    table = pl.DataFrame(found, schema=schema, orient="row").with_columns(
+    table = pl.DataFrame(found, schema=table_schema(ResultRow), orient="row").with_columns(
         pl.col("value", "low", "high").fill_nan(None)
     )
     write_table(store.folder / "trials.csv", store.trials_table())

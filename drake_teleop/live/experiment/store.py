@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import polars as pl
 
@@ -46,10 +47,13 @@ class TrialRow:
     lost_s: float
 
 
-_TRIAL_SCHEMA: dict[str, type[pl.DataType]] = {
-    field.name: {"int": pl.Int64, "float": pl.Float64, "str": pl.String}[str(field.type)]
-    for field in dataclasses.fields(TrialRow)
-}
+def table_schema(row: type) -> dict[str, type[pl.DataType]]:
+    """Return the column types of a table whose rows have the annotated fields of a class."""
+    types: dict[type, type[pl.DataType]] = {int: pl.Int64, float: pl.Float64, str: pl.String}
+    return {name: types[kind] for name, kind in get_type_hints(row).items()}
+
+
+_TRIAL_SCHEMA = table_schema(TrialRow)
 
 
 @dataclass(frozen=True)
