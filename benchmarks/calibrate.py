@@ -37,7 +37,7 @@ from drake_teleop.load.tolerance import (
     required_values,
     tolerances_in_units,
 )
-from drake_teleop.robots.calibration import Evaluation, calibrate
+from drake_teleop.robots.calibration import RecordEvaluation, calibrate
 from drake_teleop.robots.recording import ReadingRecorder
 from drake_teleop.robots.streams import Reading
 
@@ -146,14 +146,18 @@ def stream_of(
     return Stream(t, np.hstack([wrench, moved + MOTION_NOISE * rng.normal(size=moved.shape)]))
 
 
-def judged(at: Evaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
+def judged(at: RecordEvaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
     """Errors over tolerances, and which intervals hold, at a look."""
-    assert at.found is not None
-    found = at.found.identification.phi
+    assert at.identified_log is not None
+    found = at.identified_log.identification.phi
     error = np.abs(
         required_values(tolerance, found) - required_values(tolerance, phi)
     ) / tolerances_in_units(tolerance, phi)
-    return {"t": at.t, "error": error.tolist(), "held": (error <= at.half).tolist()}
+    return {
+        "t": at.record_length_s,
+        "error": error.tolist(),
+        "held": (error <= at.relative_half_widths).tolist(),
+    }
 
 
 def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
@@ -172,18 +176,22 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
             stream, keeps = posed(rng, phi, SECONDS)
         else:
             stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), ReadingRecorder()
-        looks = calibrate(stream, keeps, folder / keeps.file, tolerance)
+        looks = calibrate(stream, keeps, folder / keeps.log_file_name, tolerance)
         for at in looks:
-            if at.found is not None:
+            if at.identified_log is not None:
                 wrong = np.array(judged(at, tolerance, phi)["error"]) > 1.0
-                false += int((wrong & at.known).sum())
-                counted += int(at.known.sum())
+                false += int((wrong & at.is_known).sum())
+                counted += int(at.is_known.sum())
         last = looks[-1]
-        if not last.known.all():
+        if not last.is_known.all():
             unknown += 1
             continue
         stops.append(judged(last, tolerance, phi))
-        hasty = next(at for at in looks if at.found is not None and (at.half <= 1.0).all())
+        hasty = next(
+            at
+            for at in looks
+            if at.identified_log is not None and (at.relative_half_widths <= 1.0).all()
+        )
         first.append(judged(hasty, tolerance, phi))
     figures: dict[str, float] = {"loads": loads, "not_known": unknown}
     figures |= {"false_known": false, "called_known_at_any_look": counted}

@@ -28,7 +28,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.streams import Compensated, Reading
+from drake_teleop.robots.streams import CompensatedWrench, Reading
 from drake_teleop.robots.udp import READING_FORMAT, UdpSink, UdpSource, pack_reading
 
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -73,7 +73,7 @@ class Timed:
         self._before = time.perf_counter()
         return found
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         """See `Sink`."""
         self._sink.write(out)
         now = time.perf_counter()
@@ -91,10 +91,12 @@ class Timed:
 class Passed(Compensator):
     """The baseline: what comes in goes out."""
 
-    def step(self, reading: Reading, now: float) -> Compensated:
+    def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Nothing but the copy."""
         self._now = now
-        return Compensated(reading.number, reading.t, reading.values[:6], reading.values[:6], 0)
+        return CompensatedWrench(
+            reading.number, reading.t, reading.values[:6], reading.values[:6], 0
+        )
 
 
 def measured(rate: float, seconds: float, kind: type[Compensator]) -> dict[str, Any]:

@@ -27,10 +27,10 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_state
-from drake_teleop.live.haply import read_message
+from drake_teleop.live.haply import parse_device_message
 from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_task_space_device
@@ -103,7 +103,7 @@ def silent() -> dict[str, float]:
     """The largest force of a guard from 50 ms of silence on, whatever was commanded before [N]."""
     largest, random = 0.0, np.random.default_rng(0)
     for _ in range(200):
-        guard = DeviceGuard(Limits(37.5))
+        guard = DeviceGuard(DeviceLimits(37.5))
         wrench, x = random.normal(0.0, 30.0, 6), np.zeros(3)
         for k in range(300):
             x = x + random.normal(0.0, 1e-4, 3)
@@ -124,7 +124,7 @@ def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> 
         observe: whether the observer is on.
     """
     virtual, most = VirtualDevice(tapping_motion(0.02), grip), int(late.max())
-    guard, heights = DeviceGuard(Limits(37.5), observe=observe), [0.01] * (most + 1)
+    guard, heights = DeviceGuard(DeviceLimits(37.5), observe=observe), [0.01] * (most + 1)
     least, resting, newest = 0.0, [], 0
     for k in range(4000):
         heights.append(virtual.position[2])
@@ -167,7 +167,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
     )  # fmt: skip
     session = Session(scenario, None, device=True)
     virtual = VirtualDevice(tapping_motion(0.02), grip)
-    guard, start = DeviceGuard(Limits(37.5), observe=observe), virtual.position[2]
+    guard, start = DeviceGuard(DeviceLimits(37.5), observe=observe), virtual.position[2]
     wrench, least, resting = np.zeros(6), 0.0, []
     for k in range(800):
         place = {"z": 1e5 * (virtual.position[2] - start), "held": 1, "clutch": 1}
@@ -204,7 +204,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         text = list(said)
         for i in random.integers(0, len(text), random.integers(1, 8)):
             text[i] = chr(random.integers(1, 300))
-        heard = read_message("".join(text))
+        heard = parse_device_message("".join(text))
         wrong += heard is not None and not np.isfinite([*heard.state.position]).all()
     link.close()
     return {"fuzz_messages": 2.0 * count, "fuzz_not_finite": wrong, "fuzz_packets_refused": refused}
@@ -219,11 +219,11 @@ def driven(seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
-        while live.is_idle or link.is_silent(clock()):  # until it has begun
+        while live.is_simulation_halted or link.is_silent(clock()):  # until it has begun
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())
-        end, lost, late = clock() + seconds, live.pace.given_up, []
+        end, lost, late = clock() + seconds, live.pace.lost_time_s, []
         while clock() < end:
             if live.pace.time_to_next_slice(clock()) <= 0:
                 late.append(-live.pace.time_to_next_slice(clock()))
@@ -232,7 +232,7 @@ def driven(seconds: float) -> dict[str, float]:
         figures = link.link_statistics(clock())
         device.wait()
         found = json.loads(told.read_text())
-        lost = live.pace.given_up - lost
+        lost = live.pace.lost_time_s - lost
         live.close()
     return {
         "drive_factor": 1.0 - lost / seconds,

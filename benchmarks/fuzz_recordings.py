@@ -35,10 +35,10 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
-from drake_teleop.live.record import Record, versions_and_digest
+from drake_teleop.live.record import SessionRecord, versions_and_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import ReadingRecorder
-from drake_teleop.robots.streams import Compensated, Reading
+from drake_teleop.robots.streams import CompensatedWrench, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
@@ -257,7 +257,7 @@ def full_disk(path: Path) -> None:
         sink = lines.TableSink(file)
         try:
             for k in range(rows):
-                sink.write(Compensated(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
+                sink.write(CompensatedWrench(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
             sink.close()
         except DrakeTeleopError:
             if file.exists():
@@ -299,7 +299,7 @@ def killed(path: Path) -> None:
     child = os.fork()
     if not child:
         with suppress(BaseException):
-            record = Record(folder, scenario, None, Inputs(), device=False)
+            record = SessionRecord(folder, scenario, None, Inputs(), device=False)
             for ms in range(10**6):
                 record.write(ms, Inputs(x=ms % 1000))
         os._exit(0)

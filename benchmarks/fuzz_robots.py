@@ -13,14 +13,22 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import Assembly, PartStreams
+from drake_teleop.robots.assembly import PartStreams, ReadingAssembler
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
-from drake_teleop.robots.ros2_messages import MESSAGE_TYPES
+from drake_teleop.robots.ros2_messages import MESSAGE_TYPE_OF_TOPIC
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
 from drake_teleop.robots.rtde import parts_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
-from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading
+from drake_teleop.robots.streams import (
+    IMU,
+    JOINTS,
+    NONZERO_WRENCH_FLAGS,
+    POSE,
+    WRENCH,
+    Part,
+    Reading,
+)
 
 LOAD = Identification(
     phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003])),
@@ -48,7 +56,9 @@ def samples(_: Path) -> list[bytes]:
 
 def messages(_: Path) -> list[bytes]:
     """Of ROS 2, each with its attachment."""
-    return [b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPES)]
+    return [
+        b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPE_OF_TOPIC)
+    ]
 
 
 def _message(name: str, k: int) -> bytes:
@@ -69,8 +79,8 @@ def _message(name: str, k: int) -> bytes:
         link = kinds["TransformStamped"](header, "tool0", motion)
         message = kinds["TFMessage"]([link])
     else:
-        message = store.types[MESSAGE_TYPES[name]](header, *data[name]())
-    return bytes(store.serialize_cdr(message, MESSAGE_TYPES[name])) + make_attachment(
+        message = store.types[MESSAGE_TYPE_OF_TOPIC[name]](header, *data[name]())
+    return bytes(store.serialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])) + make_attachment(
         k, ns, b"x" * 16
     )
 
@@ -98,7 +108,7 @@ def netft_wrenches(path: Path) -> None:
             yield Part(IMU, k, DT * k, still)
             yield source.part_of_packet(packet, DT * k)
 
-    _checked(Assembly(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
@@ -112,10 +122,10 @@ def rtde_wrenches(path: Path) -> None:
     parts = (
         part for each in whole for part in parts_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
     )
-    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), parts)
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), parts)
 
 
-_SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPES}
+_SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPE_OF_TOPIC}
 _MESSAGES = CdrConverter(-1.0, _FRAMES, _JOINTS)
 
 
@@ -126,21 +136,21 @@ def ros_wrenches(path: Path) -> None:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
             parts += _MESSAGES.parts_of_cdr(name, message[:-_SENT], message[-_SENT:])
-    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), iter(parts))
+    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:
     return [content[k : k + size] for k in range(0, len(content), size)]
 
 
-def _checked(assembly: Assembly, parts: Iterator[Part]) -> None:
+def _checked(assembly: ReadingAssembler, parts: Iterator[Part]) -> None:
     compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
     for k, part in enumerate(parts):
-        found: list[Reading] = assembly.complete_readings(part, DT * k / 3)
+        found: list[Reading] = assembly.readings_completed_by(part, DT * k / 3)
         for reading in found:
             out = compensator.step(reading, DT * k / 3)
             numbers = np.array([out.t, *out.contact, *out.scaled])
-            zero = bool(out.flags & ~NONZERO_FLAGS)
+            zero = bool(out.flags & ~NONZERO_WRENCH_FLAGS)
             if not np.isfinite(numbers).all() or (np.abs(numbers[1:]) > RANGE).any():
                 raise AssertionError(f"{out!r}")
             if zero and numbers[1:].any():

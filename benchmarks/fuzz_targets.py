@@ -48,8 +48,8 @@ from drake_teleop.logs.read.bags import list_topics, read_topic
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.lines import parse_reading
-from drake_teleop.robots.streams import NONZERO_FLAGS, Reading
+from drake_teleop.robots.lines import reading_of_json_line
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, Reading
 from drake_teleop.station.channel import network
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.result import Signal, SimulationResult
@@ -557,12 +557,12 @@ def _wrenches(path: Path) -> None:
         parts = [content[k : k + size] for k in range(0, len(content), size)]
         readings = [udp.unpack_reading(part) for part in parts]
     else:
-        readings = [parse_reading(line, k) for k, line in enumerate(content.split(b"\n"))]
+        readings = [reading_of_json_line(line, k) for k, line in enumerate(content.split(b"\n"))]
     compensator = Compensator(robots.LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
     for k, reading in enumerate(readings):
         out = compensator.step(reading, 1e-3 * k)
         numbers = np.array([out.t, *out.contact, *out.scaled])
-        zero = bool(out.flags & ~NONZERO_FLAGS)
+        zero = bool(out.flags & ~NONZERO_WRENCH_FLAGS)
         if not np.isfinite(numbers).all() or (np.abs(numbers[1:]) > 50.0).any():
             raise AssertionError(f"{out!r}")
         if zero and numbers[1:].any():

@@ -28,8 +28,12 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.compensation_step import clip_wrenches, eliminate_into, value_problem
-from drake_teleop.robots.controller.c99 import CFLAGS, Target, kernel_files
+from drake_teleop.robots.compensation_step import (
+    clip_wrenches,
+    contact_and_scaled_wrench_into,
+    reading_problem,
+)
+from drake_teleop.robots.controller.c99 import CFLAGS, ControllerTarget, kernel_files
 from drake_teleop.robots.streams import Reading
 
 HERE = Path(__file__).parent
@@ -41,7 +45,7 @@ LOAD = Identification(
 )
 SCALES = {"sigma_weight": 0.3, "sigma_inertia": 1.2, "gamma": 1.3}
 DT = 1.0 / 1024.0  # exact, because times decide whether the low-pass restarts
-TARGET = Target(LOAD, DT, 30.0, np.repeat([170.0, 9.0], 3), -1, [])
+TARGET = ControllerTarget(LOAD, DT, 30.0, np.repeat([170.0, 9.0], 3), -1, [])
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
 WASM = runpy.run_path(str(HERE.parent / "docs" / "_ext" / "kernel_page.py"))
 NODE = """
@@ -134,15 +138,17 @@ def in_node(folder: Path) -> tuple[Array, float, int]:
 def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, memory, rest, out):
     """The compiled Python kernel, as the exported step calls it."""
     for k in range(len(rows)):
-        if value_problem(rows[k, :15], largest, limits) == 0:
+        if reading_problem(rows[k, :15], largest, limits) == 0:
             parts = rows[k, :15], rows[k, 15:]
-            eliminate_into(*parts, offsets, phi, nothing, scales, low_pass, memory, rest, 0, out)
+            contact_and_scaled_wrench_into(
+                *parts, offsets, phi, nothing, scales, low_pass, memory, rest, 0, out
+            )
             clip_wrenches(out, limits)
 
 
 def python_ns(rows: Array) -> float:
     """ns per reading of the compiled Python kernel: best of three."""
-    s = TARGET.make_compensator().settings
+    s = TARGET.make_compensator().c_settings
     scales = np.array([1.2, 1.2, 1.3, -0.9])
     best = np.inf
     for _ in range(4):

@@ -52,20 +52,20 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     scenario = live_scenario(LoadScenario("contact_transition"))
     load = identified_load(scenario)
     clock = time.perf_counter
-    live = Live(scenario, load, folder, PageScene("own", scenario).show, clock())
+    live = Live(scenario, load, folder, PageScene("own", scenario).frame_part, clock())
     live.join(1, clock())
     for _ in range(200):  # what is compiled and loaded at the first call
         live.tick(clock)
         time.sleep(live.time_to_next_tick(clock()))
     late, bytes_sent, touched, frames = [], 0, 0, 0
-    start, cpu, lost = clock(), time.process_time(), live.pace.given_up
+    start, cpu, lost = clock(), time.process_time(), live.pace.lost_time_s
     next_message = start
     while clock() - start < seconds:
         now = clock()
         if now >= next_message:
             next_message += FRAME_PERIOD_S
             live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.is_idle and live.pace.time_to_next_slice(now) <= 0:
+        if not live.is_simulation_halted and live.pace.time_to_next_slice(now) <= 0:
             late.append(-live.pace.time_to_next_slice(now))
         frame = live.tick(clock)
         if frame is not None:
@@ -74,7 +74,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         time.sleep(live.time_to_next_tick(clock()))
     elapsed, cpu = clock() - start, time.process_time() - cpu
     p50, p95, p99, most = 1e3 * np.percentile(late, [50, 95, 99, 100])
-    lost = live.pace.given_up - lost
+    lost = live.pace.lost_time_s - lost
     live.close()
     return {
         "factor": 1.0 - lost / elapsed,

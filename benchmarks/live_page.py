@@ -24,8 +24,8 @@ from browser import CHROMIUM, Page, opened
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.live import TOUCH_FORCE_N, Live
+from drake_teleop.live.hand import TARGET_LEAD_TIME_S
+from drake_teleop.live.live import DISPLAYED_TOUCH_FORCE_N, Live
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.server import LiveDrive, drive
 from drake_teleop.live.session import Session
@@ -98,7 +98,7 @@ def way(speed: float = 0.12) -> float:
     session.new_rows()
     R_WS, start, place = np.empty((3, 3)), np.full(3, np.nan), np.empty(3)
     while True:
-        ahead = LEAD_TIME_S + 1e-3 * (session.ms - 1000)
+        ahead = TARGET_LEAD_TIME_S + 1e-3 * (session.ms - 1000)
         session.apply_inputs(session.inputs.with_changes({"z": 1e5 * speed * ahead}))
         session.advance(1)
         q = session.new_rows()["slave_state"][-1, : table.shape[0] - 1]
@@ -190,8 +190,8 @@ def free_motion(seconds: float) -> dict[str, float]:
         "free_s": seconds,
         "free_peak_acceleration": fastest,
         "free_contact_force_max_N": float(forces[:, 0].max()),
-        "free_vibrates_by_contact": float((forces[:, 0] >= TOUCH_FORCE_N).mean()),
-        "free_vibrates_by_measured": float((forces[:, 1] >= TOUCH_FORCE_N).mean()),
+        "free_vibrates_by_contact": float((forces[:, 0] >= DISPLAYED_TOUCH_FORCE_N).mean()),
+        "free_vibrates_by_measured": float((forces[:, 1] >= DISPLAYED_TOUCH_FORCE_N).mean()),
     }
 
 

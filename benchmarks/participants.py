@@ -6,10 +6,10 @@ Each simulated participant does one condition of an experiment (`drake_teleop.li
 intervals, and the answer which of them had the stimulus. Its answers come from the level of the
 stimulus directly, by a psychometric function whose threshold (d' = 1) is drawn from the middle 90 %
 of the levels, log-uniform; no station runs. Counted is in how many the 95 % interval of the
-threshold has the true one, in observers that are as `Psi` thinks and in others; the error is the
-factor by which two thirds of the estimates are off, at most. Of the same participants a staircase
-(two down, one up, steps of a factor 1.4; Levitt 1971) is asked, which goes to 71 % correct, at d'
-of 0.77: its error is about that level, and it has no interval.
+threshold has the true one, in observers that are as `PsiMethod` assumes and in others; the error is
+the factor by which two thirds of the estimates are off, at most. Of the same participants a
+staircase (two down, one up, steps of a factor 1.4; Levitt 1971) is asked, which goes to 71 %
+correct, at d' of 0.77: its error is about that level, and it has no interval.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
 
 LOW, HIGH = 0.2, 20.0
 """Range of the levels, N say."""
@@ -33,7 +33,7 @@ Curve = Callable[[float], float]
 
 
 def as_thought(rng: np.random.Generator, threshold: float) -> Curve:
-    """Slope and lapses from within what `Psi` thinks possible."""
+    """Slope and lapses from within what `PsiMethod` thinks possible."""
     slope, lapse = np.exp(rng.uniform(np.log(0.7), np.log(3.0))), rng.uniform(0.0, 0.06)
     return lambda x: float(correct_probability(x, threshold, slope, lapse))
 
@@ -50,7 +50,7 @@ def weibull(rng: np.random.Generator, threshold: float) -> Curve:
 
 
 def inattentive(rng: np.random.Generator, threshold: float) -> Curve:
-    """Lapses in 10 % of the trials, more than `Psi` thinks possible."""
+    """Lapses in 10 % of the trials, more than `PsiMethod` thinks possible."""
     return lambda x: float(correct_probability(x, threshold, 1.5, 0.1))
 
 
@@ -64,9 +64,9 @@ def noticing(rng: np.random.Generator, threshold: float) -> Curve:
 OBSERVERS = (as_thought, without_lapse, weibull, inattentive, noticing)
 
 
-def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> Psi:
+def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> PsiMethod:
     """What a participant's answers say."""
-    psi = Psi(LOW, HIGH)
+    psi = PsiMethod(LOW, HIGH)
     for _ in range(trials):
         level = psi.next_level()
         psi.update(level, bool(rng.random() < curve(level)))

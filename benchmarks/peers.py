@@ -162,7 +162,11 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
                 error / tolerances_in_units(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
             )
             if name == "ours":
-                false += int((at.sure & (relative > np.repeat([0.5, 0.5, 5.0], [1, 3, 6]))).sum())
+                false += int(
+                    (
+                        at.is_within_tolerance & (relative > np.repeat([0.5, 0.5, 5.0], [1, 3, 6]))
+                    ).sum()
+                )
             if each.low is not None and each.high is not None:
                 held = (each.low[6:] <= phi) & (phi <= each.high[6:])
                 covered[name].append(held)

@@ -25,7 +25,7 @@ from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import INPUT_RANGES, NETWORKS, SLICE_MS, Inputs
 from drake_teleop.live.scenarios import live_scenario
-from drake_teleop.live.session import Drive, Session, read_drive
+from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
@@ -79,12 +79,12 @@ def driven(seconds: float, folder: Path) -> None:
     session.close()
 
 
-def begun(drive: Drive, late: int) -> SimulationResult:
+def begun(drive: RecordedDrive, late: int) -> SimulationResult:
     """The log of the first hundred changes, of which the 20th comes late [ms]."""
     changes = list(drive.changes[:100])
     ms, inputs = changes[20]
     changes[20] = ms + late, inputs
-    return Drive(drive.scenario, drive.load, changes).repeat(show_no_progress(""))
+    return RecordedDrive(drive.scenario, drive.load, changes).repeat(show_no_progress(""))
 
 
 def differ(one: SimulationResult, other: SimulationResult) -> int:

@@ -35,7 +35,7 @@ from drake_teleop.logs.sample import sample_log_command
 from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import TARE_REST_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.streams import CompensatedWrench
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 CHUNKS = (1, 7, 256, 10**9)
@@ -46,10 +46,10 @@ ANY = Identification(
 )
 
 
-class Kept(list[Compensated]):
+class Kept(list[CompensatedWrench]):
     """A sink."""
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         """See `Sink`."""
         self.append(out)
 

@@ -39,7 +39,7 @@ from drake_teleop.load.tolerance import (
     required_values,
     tolerances_in_units,
 )
-from drake_teleop.robots.calibration import interval_half_widths
+from drake_teleop.robots.calibration import half_widths_over_tolerances
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,9 @@ class Tables:
     def judged(self, found: Identification) -> NDArray[np.bool_]:
         """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
         tolerance = read_tolerance(UNTIL)
-        half, wide, _ = interval_half_widths(SimpleNamespace(identification=found), tolerance)  # type: ignore[arg-type]
+        half, wide, _ = half_widths_over_tolerances(
+            SimpleNamespace(identification=found), tolerance
+        )  # type: ignore[arg-type]
         error = np.abs(required_values(tolerance, found.phi) - required_values(tolerance, self.phi))
         error /= tolerances_in_units(tolerance, self.phi)
         return np.array([error <= half, error <= wide, error <= 1.0])
@@ -182,24 +184,33 @@ def counted(name: str, inside: list[NDArray[np.bool_]], loads: int) -> dict[str,
 def calibrations(folder: Path, loads: int) -> dict[str, float]:
     """Counts over calibrations from topics, each of another load."""
     from drake_teleop.robots.calibration import calibrate
-    from drake_teleop.robots.connections import open_recording
+    from drake_teleop.robots.connections import open_source_and_recorder
 
     inside: list[NDArray[np.bool_]] = []
     with ExitStack() as stack:
         tables = Tables(stack, folder)
         for k in range(loads):
             tables.next()
-            stream, recorder = open_recording(SOURCE, None)
-            for name in recorder.files:
+            stream, recorder = open_source_and_recorder(SOURCE, None)
+            for name in recorder.file_names:
                 (folder / name).unlink(missing_ok=True)
-            looks = calibrate(stream, recorder, folder / recorder.file, read_tolerance(UNTIL))
+            looks = calibrate(
+                stream, recorder, folder / recorder.log_file_name, read_tolerance(UNTIL)
+            )
             stream.close()
             last = looks[-1]
-            if last.found is not None and last.known.all():
-                inside.append(tables.judged(last.found.identification))
-                print(f"{k}: {last.t:.1f} s {inside[-1].all(axis=1).tolist()}", flush=True)
+            if last.identified_log is not None and last.is_known.all():
+                inside.append(tables.judged(last.identified_log.identification))
+                print(
+                    f"{k}: {last.record_length_s:.1f} s {inside[-1].all(axis=1).tolist()}",
+                    flush=True,
+                )
             else:
-                print(f"{k}: {last.t:.1f} s {last.why} {last.doubts} {last.half}", flush=True)
+                print(
+                    f"{k}: {last.record_length_s:.1f} s {last.failure} {last.doubts}"
+                    f" {last.relative_half_widths}",
+                    flush=True,
+                )
     return counted("calibrations", inside, loads)
 
 

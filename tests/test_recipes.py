@@ -23,7 +23,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
-from drake_teleop.robots.export import export_text
+from drake_teleop.robots.export import export_load
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import ENVIRONMENTS, LoadScenario, Scenario, ScenarioFromData
@@ -160,7 +160,7 @@ def test_export_source_and_sink_by_their_registered_names(folder):
     s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
     wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
     found = identify_batch(wrench, s, omega, alpha, method="data_sheet").identification
-    assert export_text(found, "kilograms")[0] == "3.000\n"
+    assert export_load(found, "kilograms")[0] == "3.000\n"
     sink, source = object(), object()
     SINKS.register("serial", lambda address: sink)
     SOURCES.register("serial", lambda address, dt: (source, dt))

@@ -23,8 +23,8 @@ from drake_teleop.load.tolerance import (
     required_values,
     tolerances_in_units,
 )
-from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
-from drake_teleop.robots.connections import open_recording
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
+from drake_teleop.robots.connections import open_source_and_recorder
 
 _BAR_CELLS, _BAR_DECADES = 24, 3.0  # cells of a bar; decades of half-width over tolerance in a bar
 
@@ -48,14 +48,14 @@ def calibrate_command(
     tolerance = read_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
-    stream, recorder = open_recording(source, limits, **stream_options)
-    path = out / recorder.file
+    stream, recorder = open_source_and_recorder(source, limits, **stream_options)
+    path = out / recorder.log_file_name
     console = Console(stderr=True, quiet=quiet)
     processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
         with Live(console=console, auto_refresh=False) as live:
 
-            def show_progress(at: Evaluation) -> None:
+            def show_progress(at: RecordEvaluation) -> None:
                 live.update(make_progress_table(at, tolerance), refresh=True)
 
             looks = calibrate(
@@ -68,25 +68,27 @@ def calibrate_command(
     write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
-        "known": dict(zip(tolerance.required_entries, last.known.tolist(), strict=True)),
-        "all_known": bool(last.known.all()),
-        "half_widths_95": dict(zip(tolerance.required_entries, last.half.tolist(), strict=True)),
+        "known": dict(zip(tolerance.required_entries, last.is_known.tolist(), strict=True)),
+        "all_known": bool(last.is_known.all()),
+        "half_widths_95": dict(
+            zip(tolerance.required_entries, last.relative_half_widths.tolist(), strict=True)
+        ),
         "doubts": list(last.doubts),
         "advice": last.advice,
-        "seconds": last.t,
+        "seconds": last.record_length_s,
         "looks": len(looks),
         "left_out": recorder.left_out,
         "clock_changes": recorder.clock_changes,
     }
     write_json(out / "summary.json", summary)
     verdict = "known" if summary["all_known"] else "[bold red]not known[/]"
-    console.print(f"{verdict} after {last.t:.1f} s: {tolerance}", highlight=False)
+    console.print(f"{verdict} after {last.record_length_s:.1f} s: {tolerance}", highlight=False)
     console.print(f"written to {out}", highlight=False, markup=False)
     return summary
 
 
-def make_progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
-    table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
+def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
+    table = Table(title=f"{at.record_length_s:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
@@ -99,17 +101,19 @@ def make_progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
         if name in entry
     ]
     values = sizes = np.full(len(units), np.nan)
-    if at.found is not None:
-        phi = at.found.identification.phi
+    if at.identified_log is not None:
+        phi = at.identified_log.identification.phi
         values, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
     for k, entry in enumerate(tolerance.required_entries):
-        half = at.half[k]
+        half = at.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            *(_make_progress_bar(half, bool(at.known[k])), _parameter_verdict(at, k)),
+            *(_make_progress_bar(half, bool(at.is_known[k])), _parameter_verdict(at, k)),
         )
-    lines = [Text(line, style="red") for line in (*at.doubts, *([at.why] if at.why else []))]
+    lines = [
+        Text(line, style="red") for line in (*at.doubts, *([at.failure] if at.failure else []))
+    ]
     if at.advice:
         lines.append(Text(f"-> {at.advice}", style="bold"))
     return Group(table, *lines)
@@ -121,22 +125,22 @@ def _make_progress_bar(half: float, known: bool) -> Text:
     return Text("█" * cells + "·" * (_BAR_CELLS - cells), style="green" if known else "yellow")
 
 
-def _parameter_verdict(at: Evaluation, k: int) -> str:
-    if at.known[k]:
+def _parameter_verdict(at: RecordEvaluation, k: int) -> str:
+    if at.is_known[k]:
         return "known"
-    if not np.isfinite(at.half[k]):
+    if not np.isfinite(at.relative_half_widths[k]):
         return "not known: no information yet"
     if at.doubts:
         return "not known: see below"
-    return "almost" if at.half[k] <= 1.0 else "not known"
+    return "almost" if at.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()
-        t = np.array([at.t for at in looks])
-        halves = np.array([at.half for at in looks])
+        t = np.array([at.record_length_s for at in looks])
+        halves = np.array([at.relative_half_widths for at in looks])
         for k, entry in enumerate(tolerance.required_entries):
             style = ("-", "--")[k // len(COLOURS) % 2]
             finite = np.isfinite(halves[:, k])
@@ -146,10 +150,15 @@ def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
         last = ""
         for at in looks:
             if at.advice and at.advice != last:
-                axes.axvline(at.t, color=GREY, linewidth=0.6)
+                axes.axvline(at.record_length_s, color=GREY, linewidth=0.6)
                 words = at.advice.split(",")[0].split(":")[0].replace(" the wrist", "")
                 axes.text(
-                    at.t, 0.02, words, rotation=90, size=7, transform=axes.get_xaxis_transform()
+                    at.record_length_s,
+                    0.02,
+                    words,
+                    rotation=90,
+                    size=7,
+                    transform=axes.get_xaxis_transform(),
                 )
                 last = at.advice
         axes.set(

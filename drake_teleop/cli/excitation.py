@@ -22,7 +22,7 @@ from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film
-from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance
@@ -150,7 +150,9 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
         "robot": robot.name,
         "criterion": found.criterion,
         **found.values,
-        "meaning": {name: _criterion_text(name, robot) for name in found.values},
+        "meaning": {
+            name: CRITERION_TEXTS[name].format(L=robot.scales.length) for name in found.values
+        },
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
@@ -164,10 +166,6 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
         "heaviest_load_kg": float(robot.limits.phi[0]),
         "assumed": list(robot.assumptions),
     }
-
-
-def _criterion_text(name: str, robot: Robot) -> str:
-    return CRITERION_TEXTS[name].format(L=robot.scales.length)
 
 
 def trajectory_table(found: Excitation) -> pl.DataFrame:

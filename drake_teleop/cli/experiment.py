@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
 from drake_teleop.live.experiment.procedure import plan_trials
 from drake_teleop.live.experiment.results import write_results
-from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_trial_store
+from drake_teleop.live.experiment.store import MAX_PARTICIPANT_NUMBER, TrialStore, open_trial_store
 from drake_teleop.station.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def experiment_command(
     return table
 
 
-def next_participant(store: Store, trials: int, wanted: int | None = None) -> int:
+def next_participant(store: TrialStore, trials: int, wanted: int | None = None) -> int:
     """Return a participant's number: the requested, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
@@ -53,9 +53,9 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
         if len(store.read_rows(number)) < trials:
             return number
     number = max(known, default=0) + 1
-    if number > MAX_PARTICIPANT:
+    if number > MAX_PARTICIPANT_NUMBER:
         raise DrakeTeleopError(
-            f"all participant numbers from 1 to {MAX_PARTICIPANT} are used",
+            f"all participant numbers from 1 to {MAX_PARTICIPANT_NUMBER} are used",
             where=str(store.folder),
             remedy="choose another folder",
         )
@@ -63,7 +63,7 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
 
 
 def _simulate_participants(
-    experiment: Experiment, scenarios: list[Scenario], store: Store, count: int
+    experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
     from drake_teleop.live.experiment.simulated import make_all_apparatus, simulate_participant
 

@@ -98,7 +98,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 @click.option("--record", type=option.PATH_TYPE, metavar="DIR", help="Record the session in DIR.")
 @click.option(
     "--port",
-    type=option.Integer(0, 65535),
+    type=option.IntegerInRange(0, 65535),
     default=0,
     show_default="any free port",
     help="TCP port of the page on localhost.",
@@ -122,13 +122,13 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 )
 @click.option(
     "--participant",
-    type=option.Integer(1, 9999),
+    type=option.IntegerInRange(1, 9999),
     show_default="the first with trials left, or a new one",
     help="Number that identifies the participant of --study.",
 )
 @click.option(
     "--simulated",
-    type=option.Integer(0, 9999),
+    type=option.IntegerInRange(0, 9999),
     default=0,
     help="Number of participants to simulate in --study; 0: people, on the page.",
 )
@@ -184,9 +184,9 @@ def parts() -> None:
 
     --register FILE adds your own parts: drake-teleop --register mine.py parts
     """
-    from drake_teleop.cli.printing import print_parts
+    from drake_teleop.cli.printing import print_registered_names
 
-    print_parts()
+    print_registered_names()
 
 
 @cli.command()
@@ -212,7 +212,7 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 @option.gripper_file
 @click.option(
     "--method",
-    type=option.PartName("estimator", "ordinary", "whitened", "robust", "consistent"),
+    type=option.RegisteredName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
     show_default=True,
     help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
@@ -387,7 +387,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @click.option("--tare", is_flag=True, help="Tare at the start: keep the tool free, at rest.")
 @click.option(
     "--control",
-    type=option.Integer(1, 65535),
+    type=option.IntegerInRange(1, 65535),
     metavar="PORT",
     help="UDP port on localhost that accepts the request `tare`.",
 )
@@ -429,7 +429,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     """
     from drake_teleop.robots.ros2_node import run_ros2_command
 
-    def calibrate(until: str, seconds: float) -> list[str]:
+    def calibrate_arguments(until: str, seconds: float) -> list[str]:
         words = ["calibrate", source, "--until", until, "--seconds", str(seconds), "--quiet"]
         words += ["--out", str(out)]
         given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
@@ -444,7 +444,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
             x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
         ]
 
-    run_ros2_command(source, load, sink, out, calibrate=calibrate, **options)
+    run_ros2_command(source, load, sink, out, calibrate=calibrate_arguments, **options)
 
 
 @cli.command()
@@ -480,7 +480,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
-_EXPORT_FORMATS = option.PartName(
+_EXPORT_FORMATS = option.RegisteredName(
     "export format",
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
     *_CONTROLLER_FORMATS,
@@ -531,7 +531,7 @@ def export(
         notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
         text = ""
     else:
-        from drake_teleop.robots.export import export_text as export_load
+        from drake_teleop.robots.export import export_load
 
         text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:
@@ -578,8 +578,10 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option("--networks", type=option.Names(), help="Network presets.  [default: all but ideal]")
-@click.option("--methods", type=option.Names(), help="Passivity methods.  [default: all]")
+@click.option(
+    "--networks", type=option.NAMES_TYPE, help="Network presets.  [default: all but ideal]"
+)
+@click.option("--methods", type=option.NAMES_TYPE, help="Passivity methods.  [default: all]")
 @click.option(
     "--scenario",
     default="contact_transition",
@@ -611,8 +613,10 @@ def compare_passivity(
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_TYPE)
-@click.option("--hands", type=option.Names(), help="Grips of the operator.  [default: light,firm]")
-@click.option("--walls", type=option.Names(), help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option(
+    "--hands", type=option.NAMES_TYPE, help="Grips of the operator.  [default: light,firm]"
+)
+@click.option("--walls", type=option.NAMES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
@@ -667,7 +671,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
 @option.jobs
 @option.dask_cluster
 @click.option(
-    "--repeats", type=option.Integer(1, 10**6), help="Runs per combination.  [default: 12]"
+    "--repeats", type=option.IntegerInRange(1, 10**6), help="Runs per combination.  [default: 12]"
 )
 @option.skip_question
 @option.output_folder("scaling-study")
@@ -690,7 +694,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 @option.package_paths
 @click.option(
     "--acceleration",
-    type=option.PositiveNumbers(),
+    type=option.POSITIVES_TYPE,
     default=(),
     help="With --model: acceleration limits [rad/s^2], one for all joints or one for each.",
 )
@@ -719,7 +723,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 )
 @click.option(
     "--harmonics",
-    type=option.Integer(2, 20),
+    type=option.IntegerInRange(2, 20),
     help="Number of harmonics.  [default: 5; 3 with --until]",
 )
 @click.option(

@@ -51,7 +51,7 @@ SCENARIO_TYPE = ShippedOrPath(scenarios_dir(), str)
 STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 
 
-def _check_range(
+def _fail_outside_range(
     kind: click.FloatRange | click.IntRange,
     number: float,
     param: click.Parameter | None,
@@ -77,18 +77,18 @@ class FiniteNumber(click.FloatRange):
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
-        _check_range(self, number, param, ctx)
+        _fail_outside_range(self, number, param, ctx)
         return number
 
 
-class Integer(click.IntRange):
+class IntegerInRange(click.IntRange):
     """Parameter type of integers in a range."""
 
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         number: int = click.INT.convert(value, param, ctx)
-        _check_range(self, number, param, ctx)
+        _fail_outside_range(self, number, param, ctx)
         return number
 
 
@@ -107,20 +107,25 @@ SCALE_TYPE = FiniteNumber(0, 100)
 POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
 
 
-class Names(click.ParamType):
-    """Parameter type of names separated by commas."""
+class CommaSeparated(click.ParamType):
+    """Parameter type of values of type `item`, separated by commas."""
 
-    name = "NAME,..."
+    def __init__(self, name: str, item: click.ParamType) -> None:
+        self.name, self._item = f"{name},...", item
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
+    ) -> tuple[Any, ...]:
         if isinstance(value, tuple):
             return value
-        return tuple(name.strip() for name in value.split(","))
+        return tuple(self._item.convert(part.strip(), param, ctx) for part in value.split(","))
 
 
-class PartName(click.Choice):
+NAMES_TYPE = CommaSeparated("NAME", click.STRING)
+POSITIVES_TYPE = CommaSeparated("number", POSITIVE_TYPE)
+
+
+class RegisteredName(click.Choice):
     """Parameter type: name of a part of this kind, shipped or registered by the user."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
@@ -137,19 +142,6 @@ class PartName(click.Choice):
     def choices(self, value: tuple[str, ...]) -> None: ...
 
 
-class PositiveNumbers(click.ParamType):
-    """Parameter type of positive numbers separated by commas."""
-
-    name = "number,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        if isinstance(value, tuple):
-            return value
-        return tuple(POSITIVE_TYPE.convert(part, param, ctx) for part in value.split(","))
-
-
 def output_folder(command: str) -> Callable[[Any], Any]:
     """Return the option `--out DIR`; a command that fails leaves no new empty folder there."""
     return click.option(
@@ -159,11 +151,11 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         show_default=True,
         metavar="DIR",
         help="Output folder.",
-        callback=_clean_up_after_failure,
+        callback=_remove_new_folders_at_end,
     )
 
 
-def _clean_up_after_failure(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _remove_new_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty_folders(new))
@@ -181,12 +173,12 @@ def _remove_empty_folders(new: list[Path]) -> None:
             return
 
 
-_SEED_TYPE = Integer(0, 2**32 - 1)
+_SEED_TYPE = IntegerInRange(0, 2**32 - 1)
 seed = click.option("--seed", type=_SEED_TYPE, help="Seed of noise.  [default: the scenario's]")
 seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, show_default=True, help="Random seed.")
 jobs = click.option(
     "--jobs",
-    type=Integer(1, 4096),
+    type=IntegerInRange(1, 4096),
     callback=lambda _ctx, _param, count: count or -1,
     help="Number of parallel processes.  [default: one for each core]",
 )

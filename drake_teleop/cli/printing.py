@@ -15,18 +15,18 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
     for heading in ("", "value", "std", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    _add_rows(table, _load_rows(summary), summary["identifiable"])
+    _add_parameter_rows(table, _load_parameter_rows(summary), summary["identifiable"])
     rows = [
         (name, value, std, 1.0, "N" if i < 3 else "N m", name)
         for i, (name, value, std) in enumerate(
             zip(PARAMETER_NAMES[:6], summary["offsets"], summary["offsets_std"], strict=True)
         )
     ]
-    _add_rows(table, rows, summary["identifiable"])
+    _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
-        _add_rows(table, rows, summary["object"]["identifiable"])
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_parameter_rows(summary["object"])]
+        _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
         f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
@@ -35,15 +35,15 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     )
     if summary["rejected"] > 0:
         figures += f"; {summary['rejected']:.1%} of them rejected as disturbed"
-    print_results(table, figures, summary, out)
+    print_table_and_notes(table, figures, summary, out)
 
 
-_TableRow: TypeAlias = tuple[str, float, float, float, str, str]
+_ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _load_rows(load: dict[str, Any]) -> list[_TableRow]:
-    rows: list[_TableRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
+def _load_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
+    rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
         for i, axis in enumerate("xyz")
@@ -54,7 +54,7 @@ def _load_rows(load: dict[str, Any]) -> list[_TableRow]:
     ]
 
 
-def _add_rows(table: Any, rows: list[_TableRow], identifiable: list[str]) -> None:
+def _add_parameter_rows(table: Any, rows: list[_ParameterRow], identifiable: list[str]) -> None:
     for label, value, std, scale, unit, name in rows:
         # The centre of mass is the moment over the mass.
         needed = {"m", name} if name.startswith("m c") else {name}
@@ -97,7 +97,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
             f" rms of |F| {causal['residual_rms']:.4g} N,"
             f" of |tau| {causal['residual_torque_rms']:.4g} N m"
         )
-    print_results(table, figures, summary, out)
+    print_table_and_notes(table, figures, summary, out)
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
@@ -127,10 +127,10 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
         f" {100 * summary['in_contact']:.3g} %\n"
         f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
     )
-    print_results(table, figures, summary, out)
+    print_table_and_notes(table, figures, summary, out)
 
 
-def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
+def print_table_and_notes(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
     """Print a table, the text `figures`, the delay, the notes and the output folder."""
     from rich.console import Console
 
@@ -145,7 +145,7 @@ def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) 
         console.print(line, highlight=False, markup=False)
 
 
-def print_parts() -> None:
+def print_registered_names() -> None:
     import click
 
     from drake_teleop.common.registry import REGISTRIES

@@ -7,20 +7,18 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
-Array = NDArray[np.float64]
-
 #: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
-CONTACT_FORCE_N = 2.0
+MIN_CONTACT_FORCE_N = 2.0
 _AT_LIMIT_FRACTION = 0.999
 _HAND_FORCE_LIMIT_N = 59.0  # N; the limit of a hand is 60 N
 _PACKET_TIMEOUT_S = 0.05  # s
@@ -35,16 +33,6 @@ def smallest_and_largest_norm_into(vectors, origins, out):
             square += (vectors[row, k] - origins[row, k]) ** 2
         least, most = min(least, square), max(most, square)
     out[0], out[1] = math.sqrt(least), math.sqrt(most)
-
-
-@njit(cache=True)
-def _joints_at_limit_bits(values, limits):
-    found = 0
-    for row in range(len(values)):
-        for k in range(len(limits)):
-            if abs(values[row, k]) >= limits[k]:
-                found |= 1 << k
-    return found
 
 
 @njit(cache=True)
@@ -64,7 +52,7 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
         before[1:] = p_WS
 
 
-class Cockpit:
+class PageValueCalculator:
     """Calculator of the page's values from rows of the log."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -87,7 +75,9 @@ class Cockpit:
         smallest_and_largest_norm_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
         smallest_and_largest_norm_into(contact_S, zeros, contact)
         smallest_and_largest_norm_into(rows["force_to_master"], zeros, rendered)
-        in_contact = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT_FORCE_N
+        in_contact = (
+            rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
+        )
         self._forces[:2] *= inputs.force_scales["force_scale"]
         _integrate_work(
             self._table,
@@ -100,16 +90,18 @@ class Cockpit:
             self._energy,
         )
         return {
-            "f": [_round_finite(pair, 4) for pair in self._forces],
+            "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
             "contact": bool(in_contact),
-            "energy": _round_finite(self._energy, 5),
-            "words": list(dict.fromkeys(self._find_warnings(rows, inputs, zeros))),
+            "energy": _rounded_or_zero(self._energy, 5),
+            "words": list(dict.fromkeys(self._present_warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
-            "tool": _round_finite(self._last_row[1:], 5),
-            "stylus": _round_finite(rows["pose_master"][-1, 4:], 5),
+            "tool": _rounded_or_zero(self._last_row[1:], 5),
+            "stylus": _rounded_or_zero(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _find_warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
+    def _present_warnings(
+        self, rows: dict[str, Array], inputs: Inputs, zeros: Array
+    ) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -125,9 +117,9 @@ class Cockpit:
         if hand[1] > _HAND_FORCE_LIMIT_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
-            at_limit = _joints_at_limit_bits(rows[name][:, part], limits)
-            if at_limit:
-                joints = [str(k + 1) for k in range(len(limits)) if at_limit >> k & 1]
+            at_limit = (np.abs(rows[name][:, part]) >= limits).any(axis=0)
+            if at_limit.any():
+                joints = [str(k + 1) for k in np.flatnonzero(at_limit)]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
         if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_TIMEOUT_S:
             yield "the network delivers no packets"
@@ -135,5 +127,5 @@ class Cockpit:
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 
-def _round_finite(values: Array, digits: int) -> list[float]:
+def _rounded_or_zero(values: Array, digits: int) -> list[float]:
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_packets import (
     MAX_PACKET_BYTES,
     DevicePose,
@@ -34,15 +34,15 @@ from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
-_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
+_CLIENT_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
 _MAX_STORED_DELAYS = 100_000  # ticks
 
 
-class Device(Protocol):
+class HapticDevice(Protocol):
     """Interface of a haptic device."""
 
     @property
-    def limits(self) -> Limits: ...
+    def limits(self) -> DeviceLimits: ...
 
     def read(self) -> DevicePose | None:
         """Return the next pose; None if none is received for 0.5 s."""
@@ -57,12 +57,12 @@ class Device(Protocol):
 class DeviceClient:
     """Connection of a haptic device to a station.
 
-    `behind` contains the delays [s] from each device position to the force that answers it.
+    `force_ages_s` contains the delays [s] from each device position to the force that answers it.
     """
 
-    def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
+    def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.behind: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
+        self.force_ages_s: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(host_and_port(address))
@@ -82,7 +82,7 @@ class DeviceClient:
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
-        elapsed = _PERIOD_S if self._last_tick is None else now - self._last_tick
+        elapsed = _CLIENT_PERIOD_S if self._last_tick is None else now - self._last_tick
         period = min(max(elapsed, 1e-5), _MAX_LATENESS_S)
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
@@ -109,7 +109,7 @@ class DeviceClient:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
-            self.behind.append(behind)
+            self.force_ages_s.append(behind)
         x, y, z = map(float, pose.position)
         w, i, j, k = map(float, pose.orientation)
         state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
@@ -126,7 +126,7 @@ class DeviceClient:
 class RealTimeVirtualDevice:
     """Virtual device that runs in real time."""
 
-    limits = Limits(force=10.0)
+    limits = DeviceLimits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:
         self.virtual = virtual
@@ -134,7 +134,7 @@ class RealTimeVirtualDevice:
         self._due = self._simulated_until = time.perf_counter()
 
     def read(self) -> DevicePose:
-        self._due += _PERIOD_S
+        self._due += _CLIENT_PERIOD_S
         now = time.perf_counter()
         if self._due > now:
             time.sleep(self._due - now)
@@ -151,7 +151,7 @@ class RealTimeVirtualDevice:
     def close(self) -> None: ...
 
 
-def open_device(address: str, grip: str, depth: float) -> Device:
+def open_device(address: str, grip: str, depth: float) -> HapticDevice:
     """Return the device at `virtual` (tapping `depth` [m] deep) or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pass
     finally:
         client.close()
-    behind = np.array(client.behind or [0.0])
+    behind = np.array(client.force_ages_s or [0.0])
     figures = {
         "behind_p50_ms": float(1e3 * np.median(behind)),
         "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),

@@ -17,14 +17,14 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
-_FADE_START_S = 0.02  # s
-_FORCE_RISE_N_S = 100.0  # N/s
-_MAX_ENERGY_J, _RESERVE_J = 0.3, 3e-5  # J
+_FORCE_FADE_START_S = 0.02  # s
+_FORCE_LIMIT_RISE_N_S = 100.0  # N/s
+_MAX_STORED_ENERGY_J, _ENERGY_RESERVE_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 
 
 @dataclass(frozen=True)
-class Limits:
+class DeviceLimits:
     """Limits of force [N], torque [N m] and their slew rates [N/s, N m/s]."""
 
     force: float
@@ -41,7 +41,7 @@ class DeviceGuard:
         slowed: number of forces that the observer has reduced.
     """
 
-    def __init__(self, limits: Limits, *, observe: bool = True) -> None:
+    def __init__(self, limits: DeviceLimits, *, observe: bool = True) -> None:
         self.energy, self.slowed = 0.0, 0
         self._limits, self._observe = limits, observe
         self._stored_energy, self._force_limit, self._was_silent = 0.0, limits.force, True
@@ -56,13 +56,13 @@ class DeviceGuard:
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)
         self.energy += work
-        self._stored_energy = min(self._stored_energy + work, _MAX_ENERGY_J)
+        self._stored_energy = min(self._stored_energy + work, _MAX_STORED_ENERGY_J)
         # Extrapolate the speed linearly, over a period of the same length.
         velocity = motion / period
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._timeout_fraction(age, period)
+        share = self._allowed_force_fraction(age, period)
         force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -76,20 +76,24 @@ class DeviceGuard:
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
-    def _timeout_fraction(self, age: float, period: float) -> float:
+    def _allowed_force_fraction(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
-        self._force_limit = min(self._force_limit + _FORCE_RISE_N_S * period, self._limits.force)
+        self._force_limit = min(
+            self._force_limit + _FORCE_LIMIT_RISE_N_S * period, self._limits.force
+        )
         return (
-            min(max((COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FADE_START_S), 0.0), 1.0)
+            min(
+                max((COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_S), 0.0), 1.0
+            )
             if age < COMMAND_TIMEOUT_S
             else 0.0
         )
 
     def _limit_returned_energy(self, force: Array, next_motion: Array) -> Array:
-        distance, available = math.hypot(*next_motion), self._stored_energy - _RESERVE_J
+        distance, available = math.hypot(*next_motion), self._stored_energy - _ENERGY_RESERVE_J
         returned = float(force @ next_motion)
         if returned <= available or distance < 1e-12 or not force.any():
             return force

@@ -31,8 +31,8 @@ from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_TIMEOUT_S = 2.0  # s
-_MAX_PACKETS = 256  # packets per poll
-_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
+_MAX_PACKETS_PER_POLL = 256  # packets per poll
+_MAX_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
 _CLUTCH_OPEN_TIME_S = 0.05
 
@@ -64,13 +64,13 @@ class DeviceLink:
         self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._latencies: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
-        self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
+        self._latencies: deque[float] = deque(maxlen=_MAX_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_MAX_STATISTICS_PACKETS)
 
     def receive_state(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
         self._polled_at = now
-        for _ in range(_MAX_PACKETS):
+        for _ in range(_MAX_PACKETS_PER_POLL):
             try:
                 packet, peer = self._socket.recvfrom(MAX_PACKET_BYTES + 1)
             except (BlockingIOError, ConnectionError):
@@ -136,7 +136,7 @@ class DeviceLink:
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
-            min(now - self._connected_at, 1e-3 * _STATISTICS_PACKETS)
+            min(now - self._connected_at, 1e-3 * _MAX_STATISTICS_PACKETS)
             if len(self._latencies) > 1
             else np.inf
         )

@@ -12,10 +12,10 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-_STATE, _FORCE = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6d")
-_FROM_DEVICE, _TO_DEVICE = b"DTD1", b"DTF1"
-MAX_PACKET_BYTES = _STATE.size  #: of both packets [bytes]
-_MAX_POSITION_M, _MAX_WRENCH = 10.0, 1e3  # m; N, N m
+_STATE_FORMAT, _FORCE_FORMAT = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6d")
+_STATE_TAG, _FORCE_TAG = b"DTD1", b"DTF1"
+MAX_PACKET_BYTES = _STATE_FORMAT.size  #: of both packets [bytes]
+_MAX_POSITION_M, _MAX_WRENCH_VALUE = 10.0, 1e3  # m; N, N m
 
 
 #: Flag of the device: its motion is not transmitted to the slave.
@@ -58,18 +58,18 @@ class ForceCommand(NamedTuple):
 
 def pack_state(state: DeviceState) -> bytes:
     numbers = (*state.position, *state.orientation, state.behind)
-    return _STATE.pack(_FROM_DEVICE, state.flags, state.number, state.t, *numbers)
+    return _STATE_FORMAT.pack(_STATE_TAG, state.flags, state.number, state.t, *numbers)
 
 
 def unpack_state(packet: bytes) -> DeviceState | None:
     """Return the device state in a packet, or None if it is invalid or implausible."""
-    if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
+    if len(packet) != _STATE_FORMAT.size or packet[:4] != _STATE_TAG:
         return None
-    _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return make_plausible_state(number, t, flags, numbers)
+    _, flags, number, t, *numbers = _STATE_FORMAT.unpack(packet)
+    return make_state_if_plausible(number, t, flags, numbers)
 
 
-def make_plausible_state(
+def make_state_if_plausible(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
     """Return the state, or None if position, orientation or `behind` is implausible."""
@@ -92,25 +92,29 @@ def make_plausible_state(
 
 def rejection_reason(packet: bytes) -> str:
     """Return as text why `unpack_state` rejects a packet."""
-    if len(packet) != _STATE.size:
-        length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
-        return f"is {length} bytes long, not {_STATE.size}"
-    if packet[:3] != _FROM_DEVICE[:3]:
-        return f"begins with {packet[:4]!r}, not {_FROM_DEVICE!r}"
-    if packet[3:4] != _FROM_DEVICE[3:]:
-        return f"has version {packet[3:4]!r}, not {_FROM_DEVICE[3:]!r}"
+    if len(packet) != _STATE_FORMAT.size:
+        length = (
+            len(packet) if len(packet) < _STATE_FORMAT.size else f"more than {_STATE_FORMAT.size}"
+        )
+        return f"is {length} bytes long, not {_STATE_FORMAT.size}"
+    if packet[:3] != _STATE_TAG[:3]:
+        return f"begins with {packet[:4]!r}, not {_STATE_TAG!r}"
+    if packet[3:4] != _STATE_TAG[3:]:
+        return f"has version {packet[3:4]!r}, not {_STATE_TAG[3:]!r}"
     return "has a position, orientation or time out of range"
 
 
 def pack_force(command: ForceCommand) -> bytes:
-    return _FORCE.pack(_TO_DEVICE, 0, command.number, command.t, *command.wrench)
+    return _FORCE_FORMAT.pack(_FORCE_TAG, 0, command.number, command.t, *command.wrench)
 
 
 def unpack_force(packet: bytes) -> ForceCommand | None:
     """Return the force command in a packet, or None if it is invalid."""
-    if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
+    if len(packet) != _FORCE_FORMAT.size or packet[:4] != _FORCE_TAG:
         return None
-    _, _, number, t, *wrench = _FORCE.unpack(packet)
-    if not (math.isfinite(t) and all(abs(f) < _MAX_WRENCH for f in wrench)):  # refuses nan, too
+    _, _, number, t, *wrench = _FORCE_FORMAT.unpack(packet)
+    if not (
+        math.isfinite(t) and all(abs(f) < _MAX_WRENCH_VALUE for f in wrench)
+    ):  # refuses nan, too
         return None
     return ForceCommand(number, t, tuple(wrench))

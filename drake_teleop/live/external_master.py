@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import (
@@ -17,6 +16,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     quaternion_exponential,
@@ -33,43 +33,57 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.plant import start_pose
 from drake_teleop.station.wiring import export_outputs
 
-Array = NDArray[np.float64]
-
 #: Period of the poses [s], and [ms].
 POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
 # largest slew rate [1/s].
-_FADE_S, _RETURN_RATE, _SLEW_RATE = 0.05, 4.0, 150.0
+_LIMIT_FADE_S, _LIMIT_RETURN_RATE_PER_S, _WRENCH_SLEW_RATE_PER_S = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
-_HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
+(
+    _HELD_INDEX,
+    _START_TIME_INDEX,
+    _START_POSE_INDEX,
+    _DISPLACEMENT_INDEX,
+    _ROTATION_INDEX,
+    _PATH_SIZE,
+) = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
-_FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
-_WRENCH_FAULT = float(Fault.WRENCH)
+_FAULT_INDEX, _ALLOWED_SHARE, _DISPLAY_STATE_SIZE = 6, 7, 8
+_WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 
 @njit(cache=True)
-def _pose_on_path(path, time, out):
-    share = min(max((time - path[_START_TIME]) / POSE_PERIOD_S, 0.0), 1.0)
-    r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
-    start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
+def _pose_and_twist_on_path_into(path, time, out):
+    share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
+    r = (
+        share * path[_ROTATION_INDEX],
+        share * path[_ROTATION_INDEX + 1],
+        share * path[_ROTATION_INDEX + 2],
+    )
+    start = (
+        path[_START_POSE_INDEX],
+        path[_START_POSE_INDEX + 1],
+        path[_START_POSE_INDEX + 2],
+        path[_START_POSE_INDEX + 3],
+    )
     rotation = quaternion_product(quaternion_exponential(r), start)
     moves = 1.0 / POSE_PERIOD_S if share < 1.0 else 0.0
     for k in range(4):
         out[k] = rotation[k]
     for k in range(3):
-        out[4 + k] = path[_START_POSE + 4 + k] + share * path[_DISPLACEMENT + k]
-        out[7 + k] = moves * path[_DISPLACEMENT + k]
-        out[10 + k] = moves * path[_ROTATION + k]
+        out[4 + k] = path[_START_POSE_INDEX + 4 + k] + share * path[_DISPLACEMENT_INDEX + k]
+        out[7 + k] = moves * path[_DISPLACEMENT_INDEX + k]
+        out[10 + k] = moves * path[_ROTATION_INDEX + k]
 
 
 @njit(cache=True)
 def _update_displayed_wrench(wrench, held, period, limits, last, now):
     fault = 0.0
     if not all_in_range(wrench):
-        fault = _WRENCH_FAULT
+        fault = _WRENCH_FAULT_NUMBER
     enabled = held and fault == 0.0
-    change = _RETURN_RATE if enabled else -1.0 / _FADE_S
-    allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)
+    change = _LIMIT_RETURN_RATE_PER_S if enabled else -1.0 / _LIMIT_FADE_S
+    allowed = min(max(last[_ALLOWED_SHARE] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
     if enabled:
         target[:] = wrench
@@ -78,10 +92,10 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit_group(step, g, _SLEW_RATE * period * limits[g])
+        limit_group(step, g, _WRENCH_SLEW_RATE_PER_S * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
-    now[_FAULT], now[_ALLOWED] = fault, allowed
+    now[_FAULT_INDEX], now[_ALLOWED_SHARE] = fault, allowed
 
 
 class ExternalMaster(LeafSystem):
@@ -109,32 +123,42 @@ class ExternalMaster(LeafSystem):
 
     def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
-        path = np.zeros(_PATH)
-        path[_HELD], path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = 1.0, -POSE_PERIOD_S, start
+        path = np.zeros(_PATH_SIZE)
+        path[_HELD_INDEX], path[_START_TIME_INDEX], path[_START_POSE_INDEX:_DISPLACEMENT_INDEX] = (
+            1.0,
+            -POSE_PERIOD_S,
+            start,
+        )
         self._path = self.DeclareNumericParameter(BasicVector(path))
         self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self.DeclareDiscreteState(np.zeros(_DISPLAY))
+        self.DeclareDiscreteState(np.zeros(_DISPLAY_STATE_SIZE))
         moves = {self.all_parameters_ticket(), self.time_ticket()}
         for name, size, calc, needed in (
             ("pose_master", 7, self._calc_pose, moves),
             ("twist_master", 6, self._calc_twist, moves),
-            ("master_state", 12, self._calc_state, moves),
+            ("master_state", 12, self._calc_master_state, moves),
             ("force_to_master", 6, self._calc_force, {self.xd_ticket()}),
             ("fault_at_hand", 1, self._calc_fault, {self.xd_ticket()}),
             ("displayed_and_fault", 7, self._calc_wrench_and_fault, {self.xd_ticket()}),
-            ("hand_wrench_E", 6, self._calc_hand, {self.xd_ticket()}),
+            ("hand_wrench_E", 6, self._calc_hand_wrench, {self.xd_ticket()}),
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_display)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
         """Interpolate the device's X_BE to `target` (7,) over 2 ms; None releases the device."""
-        now, path = self._current_pose_and_twist(context), np.zeros(_PATH)
-        path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
+        now, path = self._current_pose_and_twist(context), np.zeros(_PATH_SIZE)
+        path[_START_TIME_INDEX], path[_START_POSE_INDEX:_DISPLACEMENT_INDEX] = (
+            context.get_time(),
+            now[:7],
+        )
         if target is not None:
-            path[_HELD], path[_DISPLACEMENT:_ROTATION] = 1.0, target[4:] - now[4:7]
-            path[_ROTATION:] = quaternion_logarithm(
+            path[_HELD_INDEX], path[_DISPLACEMENT_INDEX:_ROTATION_INDEX] = (
+                1.0,
+                target[4:] - now[4:7],
+            )
+            path[_ROTATION_INDEX:] = quaternion_logarithm(
                 quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
             )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
@@ -143,7 +167,7 @@ class ExternalMaster(LeafSystem):
         """Do nothing: a real hand keeps its impedance."""
 
     def _current_pose_and_twist(self, context: Context) -> Array:
-        _pose_on_path(
+        _pose_and_twist_on_path_into(
             context.get_numeric_parameter(self._path).value(),
             context.get_time(),
             self._pose_and_twist,
@@ -156,28 +180,28 @@ class ExternalMaster(LeafSystem):
     def _calc_twist(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._current_pose_and_twist(context)[7:])
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
+    def _calc_master_state(self, context: Context, output: BasicVector) -> None:
         pose = self._current_pose_and_twist(context)
         rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
         angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
         output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:_FAULT])
+        output.SetFromVector(context.get_discrete_state_vector().value()[:_FAULT_INDEX])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = context.get_discrete_state_vector().value()[_FAULT]
+        output[0] = context.get_discrete_state_vector().value()[_FAULT_INDEX]
 
     def _calc_wrench_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:_ALLOWED])
+        output.SetFromVector(context.get_discrete_state_vector().value()[:_ALLOWED_SHARE])
 
-    def _calc_hand(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT])
+    def _calc_hand_wrench(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT_INDEX])
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_display(self, context: Context, discrete_state: DiscreteValues) -> None:
         _update_displayed_wrench(
             self._command.Eval(context),
-            context.get_numeric_parameter(self._path).value()[_HELD] > 0.5,
+            context.get_numeric_parameter(self._path).value()[_HELD_INDEX] > 0.5,
             self._period,
             self._limits,
             context.get_discrete_state_vector().value(),

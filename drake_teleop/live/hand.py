@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -17,6 +16,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     add_cross_product,
     conjugate_quaternion,
@@ -40,47 +40,60 @@ from drake_teleop.station.operator.operator import (
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.wiring import export_outputs
 
-Array = NDArray[np.float64]
-
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
 # half the distance in 46 ms. After a change of the grip the path is slower.
-_TRANSLATION_POLE = 2 * math.pi * 16.0
-_GRIP_CHANGE_POLE = _ROTATION_POLE = 2 * math.pi * 5.0
+_TRANSLATION_POLE_RAD_S = 2 * math.pi * 16.0
+_GRIP_CHANGE_POLE_RAD_S = _ROTATION_POLE_RAD_S = 2 * math.pi * 5.0
 #: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
 #: stop the error is at most the distance of 5 ms.
-LEAD_TIME_S = 2.5 / _TRANSLATION_POLE
+TARGET_LEAD_TIME_S = 2.5 / _TRANSLATION_POLE_RAD_S
 # Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
 # target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
-_HELD, _START_TIME, _POLES, _TARGET, _OFFSET, _ROTATION, _PATH = 0, 1, 2, 3, 10, 19, 25
+(
+    _HELD_INDEX,
+    _START_TIME_INDEX,
+    _POLE_INDEX,
+    _TARGET_POSE_INDEX,
+    _OFFSET_INDEX,
+    _ROTATION_INDEX,
+    _PATH_SIZE,
+) = 0, 1, 2, 3, 10, 19, 25
 _INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
 @njit(cache=True)
 def _intended_motion_into(path, time, pose, out):
     """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
-    if path[_HELD] < 0.5:
+    if path[_HELD_INDEX] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
         return
-    t = time - path[_START_TIME]
-    w = path[_POLES]  # (d/dt + w)^3 x = 0, and (d/dt + _ROTATION_POLE)^2 r = 0
-    decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE * t)
+    t = time - path[_START_TIME_INDEX]
+    w = path[_POLE_INDEX]  # (d/dt + w)^3 x = 0, and (d/dt + _ROTATION_POLE_RAD_S)^2 r = 0
+    decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE_RAD_S * t)
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
         # x = (a + b t + c t^2) e^(-w t), and its derivatives
-        a, v = path[_OFFSET + k], path[_OFFSET + 3 + k]
+        a, v = path[_OFFSET_INDEX + k], path[_OFFSET_INDEX + 3 + k]
         b = v + w * a
-        c = 0.5 * (path[_OFFSET + 6 + k] + w * (b + v))
+        c = 0.5 * (path[_OFFSET_INDEX + 6 + k] + w * (b + v))
         x = a + t * (b + t * c)
         slope = b + 2.0 * c * t
-        out[4 + k] = path[_TARGET + 4 + k] + x * decay
+        out[4 + k] = path[_TARGET_POSE_INDEX + 4 + k] + x * decay
         out[7 + k] = (slope - w * x) * decay
         out[13 + k] = (2.0 * c - w * (2.0 * slope - w * x)) * decay
-        turning = path[_ROTATION + 3 + k] + _ROTATION_POLE * path[_ROTATION + k]
-        r[k] = (path[_ROTATION + k] + turning * t) * turning_decay
-        rate[k] = (path[_ROTATION + 3 + k] - _ROTATION_POLE * turning * t) * turning_decay
-    target = (path[_TARGET], path[_TARGET + 1], path[_TARGET + 2], path[_TARGET + 3])
+        turning = path[_ROTATION_INDEX + 3 + k] + _ROTATION_POLE_RAD_S * path[_ROTATION_INDEX + k]
+        r[k] = (path[_ROTATION_INDEX + k] + turning * t) * turning_decay
+        rate[k] = (
+            path[_ROTATION_INDEX + 3 + k] - _ROTATION_POLE_RAD_S * turning * t
+        ) * turning_decay
+    target = (
+        path[_TARGET_POSE_INDEX],
+        path[_TARGET_POSE_INDEX + 1],
+        path[_TARGET_POSE_INDEX + 2],
+        path[_TARGET_POSE_INDEX + 3],
+    )
     orientation = quaternion_product(quaternion_exponential((r[0], r[1], r[2])), target)
     for k in range(4):
         out[k] = orientation[k]
@@ -111,14 +124,17 @@ def _rotation_vector_rate(r, omega):
 
 @njit(cache=True)
 def _start_path_into(path, time, now, target, poles):
-    path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
-    copy_into(path, _TARGET, target, 0, 7)
+    path[_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, poles
+    copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
     rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
     rate = _rotation_vector_rate(rotation, vector_at(now, 10))
     for k in range(3):
-        path[_OFFSET + k], path[_OFFSET + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
-        path[_OFFSET + 6 + k] = now[13 + k]
-        path[_ROTATION + k], path[_ROTATION + 3 + k] = rotation[k], rate[k]
+        path[_OFFSET_INDEX + k], path[_OFFSET_INDEX + 3 + k] = (
+            now[4 + k] - target[4 + k],
+            now[7 + k],
+        )
+        path[_OFFSET_INDEX + 6 + k] = now[13 + k]
+        path[_ROTATION_INDEX + k], path[_ROTATION_INDEX + 3 + k] = rotation[k], rate[k]
 
 
 @njit(cache=True, borrows=True)
@@ -150,28 +166,32 @@ class LiveHand(Operator):
         self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
-        path = np.zeros(_PATH)
-        path[_HELD], path[_POLES], path[_TARGET:_OFFSET] = 1.0, _TRANSLATION_POLE, self._intent[1]
+        path = np.zeros(_PATH_SIZE)
+        path[_HELD_INDEX], path[_POLE_INDEX], path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = (
+            1.0,
+            _TRANSLATION_POLE_RAD_S,
+            self._intent[1],
+        )
         self._path = self.DeclareNumericParameter(BasicVector(path))
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
         """Start a smooth path to the pose X_BE `target` (7,); None releases the stylus."""
-        path = np.zeros(_PATH)
+        path = np.zeros(_PATH_SIZE)
         if target is not None:
             _start_path_into(
                 path,
                 context.get_time(),
                 self._current_motion(context),
                 target,
-                _TRANSLATION_POLE,
+                _TRANSLATION_POLE_RAD_S,
             )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
         """Change the hand's impedance without a step of its wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
-        if path[_HELD] < 0.5:
+        if path[_HELD_INDEX] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._current_motion(context)
@@ -191,7 +211,11 @@ class LiveHand(Operator):
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
         _start_path_into(
-            path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _GRIP_CHANGE_POLE
+            path,
+            context.get_time(),
+            intention,
+            path[_TARGET_POSE_INDEX:_OFFSET_INDEX].copy(),
+            _GRIP_CHANGE_POLE_RAD_S,
         )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 

@@ -12,26 +12,26 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.live.device_guard import Limits
+from drake_teleop.live.device_guard import DeviceLimits
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DevicePose,
     DeviceState,
-    make_plausible_state,
+    make_state_if_plausible,
 )
 
-_MAX_MESSAGE_BYTES, _TIMEOUT_S = 65536, 0.5  # bytes of a message, s
+_MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
-class Message(NamedTuple):
+class DeviceMessage(NamedTuple):
     """Content of a message: name of the device, and its state in its base frame B."""
 
-    device: str
+    device_name: str
     state: DeviceState
 
 
-def read_message(text: Any) -> Message | None:
+def parse_device_message(text: Any) -> DeviceMessage | None:
     """Return the content of a message, or None without a plausible device pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
@@ -39,18 +39,18 @@ def read_message(text: Any) -> Message | None:
         content = json.loads(text)
         cursor = content["inverse3"][0]
         place, name = cursor["state"]["cursor_position"], cursor["device_id"]
-        x, y, z = (_check_number(place[axis]) for axis in "xyz")
+        x, y, z = (_require_finite_float(place[axis]) for axis in "xyz")
         grip: Any = next((content[key][0]["state"] for key in _GRIP_KEYS if content.get(key)), {})
         turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
-        w, i, j, k = (_check_number(turn[axis]) for axis in "wxyz")
+        w, i, j, k = (_require_finite_float(turn[axis]) for axis in "wxyz")
         pressed = (grip.get("buttons") or {}).get("a") is True
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
         return None
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = make_plausible_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
-    return None if state is None else Message(name, state)
+    state = make_state_if_plausible(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    return None if state is None else DeviceMessage(name, state)
 
 
 def make_force_message(device: str, wrench: Sequence[float]) -> str:
@@ -61,7 +61,7 @@ def make_force_message(device: str, wrench: Sequence[float]) -> str:
     )
 
 
-def _check_number(value: Any) -> float:
+def _require_finite_float(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
         raise ValueError(value)
     return float(value)
@@ -70,7 +70,7 @@ def _check_number(value: Any) -> float:
 class HaplyDevice:
     """Haply Inverse3 at haply://HOST:PORT."""
 
-    limits = Limits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
+    limits = DeviceLimits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
 
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
@@ -98,7 +98,7 @@ class HaplyDevice:
         from websockets.exceptions import ConnectionClosed
 
         try:
-            message = read_message(self._socket.recv(timeout=_TIMEOUT_S))
+            message = parse_device_message(self._socket.recv(timeout=_RECEIVE_TIMEOUT_S))
         except TimeoutError:
             return None
         except ConnectionClosed as error:
@@ -109,7 +109,7 @@ class HaplyDevice:
             ) from error
         if message is None:
             return None
-        self._device = message.device
+        self._device = message.device_name
         return DevicePose(message.state.position, message.state.orientation, message.state.flags)
 
     def set_wrench(self, wrench: Sequence[float]) -> None:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import read_text
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_logarithm
 from drake_teleop.common.version import __version__
@@ -21,8 +21,6 @@ from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
-
-Array = NDArray[np.float64]
 
 AS_IN_SCENARIO = "as in the scenario"
 NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
@@ -33,7 +31,7 @@ INPUTS_FILE = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
 LENGTH_UNIT_M, ANGLE_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
-_SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
+_SIGMA_UNIT, _FORCE_SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
@@ -101,17 +99,17 @@ class Inputs:
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
         sigma, sigma_object, gamma = (
-            round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
+            round(s / _SIGMA_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
         config = scenario.force_scaling
         apart = config.sigma_weight is not None or config.sigma_inertia is not None
-        weight = round(config.scales().weight_gripper / _SHARE_UNIT) if apart else -1
+        weight = round(config.scales().weight_gripper / _SIGMA_UNIT) if apart else -1
         started = cls(
             sigma=sigma,
             sigma_weight=weight,
             sigma_object=sigma_object,
             gamma=gamma,
-            force_scale=round(config.force_scale / _SCALE_UNIT),
+            force_scale=round(config.force_scale / _FORCE_SCALE_UNIT),
         )
         return started.with_changes(initial_choices(scenario))
 
@@ -150,7 +148,7 @@ class Inputs:
         )
         return np.concatenate([turn, start + LENGTH_UNIT_M * np.array([self.x, self.y, self.z])])
 
-    def with_held_pose(self, pose: Array, start: Array) -> Inputs:
+    def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
         turn = quaternion_logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH_UNIT_M, strict=True)
@@ -160,11 +158,11 @@ class Inputs:
     @property
     def force_scales(self) -> dict[str, Any]:
         return {
-            "sigma_weight": None if self.sigma_weight < 0 else _SHARE_UNIT * self.sigma_weight,
-            "sigma_gripper": _SHARE_UNIT * self.sigma,
-            "sigma_object": _SHARE_UNIT * self.sigma_object,
-            "gamma": _SHARE_UNIT * self.gamma,
-            "force_scale": _SCALE_UNIT * self.force_scale,
+            "sigma_weight": None if self.sigma_weight < 0 else _SIGMA_UNIT * self.sigma_weight,
+            "sigma_gripper": _SIGMA_UNIT * self.sigma,
+            "sigma_object": _SIGMA_UNIT * self.sigma_object,
+            "gamma": _SIGMA_UNIT * self.gamma,
+            "force_scale": _FORCE_SCALE_UNIT * self.force_scale,
         }
 
 
@@ -198,10 +196,10 @@ def input_range(name: str) -> tuple[int, int]:
     return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
 
 
-_VERSIONS = {"drake_teleop": __version__}
+_PACKAGE_VERSION = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _VERSIONS) -> str:
+def csv_header(made_by: Mapping[str, str] = _PACKAGE_VERSION) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -212,12 +210,16 @@ def csv_row(ms: int, inputs: Inputs) -> str:
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSIONS) -> list[tuple[int, Inputs]]:
+def read_inputs(
+    path: Path, made_by: Mapping[str, str] = _PACKAGE_VERSION
+) -> list[tuple[int, Inputs]]:
     """Return the recorded times [ms] and inputs of each change; the last is the end."""
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:
-        raise _no_repeat_error("does not contain the version of drake_teleop that wrote it", path)
+        raise _not_repeatable_error(
+            "does not contain the version of drake_teleop that wrote it", path
+        )
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
             "does not contain the inputs of a recorded live session",
@@ -230,8 +232,8 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSIONS) -> list[tupl
             found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _no_repeat_error(changed if name == "files" else what, path)
-    changes = list(_parse_rows(lines[2:], path))
+            raise _not_repeatable_error(changed if name == "files" else what, path)
+    changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError(
             "has a duration of 0 s", where=str(path), remedy="record the session again"
@@ -239,12 +241,12 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSIONS) -> list[tupl
     return changes
 
 
-def _no_repeat_error(what: str, path: Path) -> DrakeTeleopError:
+def _not_repeatable_error(what: str, path: Path) -> DrakeTeleopError:
     remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {path.parent}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 
-def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
+def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
     earlier, choices = -1, choice_names()
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
@@ -258,7 +260,7 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _no_repeat_error(f"has the unknown {name} {line[column]!r}", path)
+                raise _not_repeatable_error(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

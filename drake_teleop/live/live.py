@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import POSE_PERIOD_MS
 from drake_teleop.live.inputs import (
@@ -29,7 +29,7 @@ from drake_teleop.live.inputs import (
 )
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.scenarios import SCENES
+from drake_teleop.live.scenarios import SCENE_NAMES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
@@ -40,12 +40,12 @@ SceneFunction = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 FRAME_PERIOD_S = 1 / 60
 _MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
-TOUCH_FORCE_N = 0.12
+DISPLAYED_TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
 # of messages.
-_SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
+_SLEEP_DELAY_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_RELEASED_INPUTS = {"held": 0, "clutch": 0}
+_RELEASED_HAND_INPUTS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
@@ -84,7 +84,7 @@ class Live:
     ) -> None:
         self._log, self._initial = log, begin or {}
         self._link, self._slice_ms = link, SLICE_MS if link is None else POSE_PERIOD_MS
-        self.refused, self.requested_scene, self.scene = 0, "", SCENES[0]
+        self.refused, self.requested_scene, self.scene = 0, "", SCENE_NAMES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
         self._drives, self._paused, self.stopped = 0, False, ""
@@ -96,7 +96,7 @@ class Live:
         self._start_session(now)
 
     def _start_session(self, now: float) -> None:
-        folder = None if self._record is None else _make_unused_folder(self._record)
+        folder = None if self._record is None else _unused_folder_path(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
         by_device = self._link is not None
@@ -110,7 +110,7 @@ class Live:
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
-        self._cockpit, self.stopped = Cockpit(self._scenario), ""
+        self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
@@ -146,12 +146,12 @@ class Live:
             "ranges": {name: input_range(name) for name in INPUT_RANGES},
             "names": choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
-            "touch": TOUCH_FORCE_N,
+            "touch": DISPLAYED_TOUCH_FORCE_N,
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
             "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
-            "scenes": SCENES,
+            "scenes": SCENE_NAMES,
         }
 
     def join(self, client: int, now: float) -> None:
@@ -163,7 +163,7 @@ class Live:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._requested = self._requested.with_changes(_RELEASED_INPUTS)
+            self._requested = self._requested.with_changes(_RELEASED_HAND_INPUTS)
             self._rates = RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
@@ -183,7 +183,7 @@ class Live:
         if "rates" in message:
             self._requested = self._rates.set_rates(message["rates"], self._requested, now)
         if "slow" in message:
-            self.pace.slow = message["slow"]
+            self.pace.slowdown = message["slow"]
             self.pace.restart(now)
         if "pause" in message and message["pause"] != self._paused:
             self._paused = message["pause"]
@@ -206,24 +206,27 @@ class Live:
         return self._session.ms
 
     @property
-    def is_idle(self) -> bool:
+    def is_simulation_halted(self) -> bool:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
-        return max(0.0, frame if self.is_idle else min(frame, self.pace.time_to_next_slice(now)))
+        return max(
+            0.0,
+            frame if self.is_simulation_halted else min(frame, self.pace.time_to_next_slice(now)),
+        )
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
         for _ in range(_SLICES_PER_TICK):
             now = clock()
-            if self.is_idle or self.pace.time_to_next_slice(now) > 0:
+            if self.is_simulation_halted or self.pace.time_to_next_slice(now) > 0:
                 break
             self.pace.begin_slice(now)
             self._simulate_slice(now)
         now = clock()
         self._poll_device(now)
-        if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_AFTER_S:
+        if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_DELAY_S:
             self._asleep = True
             self._stop_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
@@ -255,7 +258,9 @@ class Live:
         self._show_now |= self._requested.hand_inputs != self._last_target
         self._last_target = self._requested.hand_inputs
         try:
-            self._session.apply_inputs(self._limit_motion(self._requested.with_changes(by_device)))
+            self._session.apply_inputs(
+                self._limited_inputs(self._requested.with_changes(by_device))
+            )
         except _FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
@@ -266,7 +271,7 @@ class Live:
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
-            pressed = self._session.contact_force() > TOUCH_FORCE_N
+            pressed = self._session.contact_force() > DISPLAYED_TOUCH_FORCE_N
             self._show_now |= pressed and not self._pressed
             self._pressed = pressed
         if self._link is not None and not self.stopped:
@@ -274,7 +279,7 @@ class Live:
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
-    def _limit_motion(self, wanted: Inputs) -> Inputs:
+    def _limited_inputs(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
         return self._limiter.limit_inputs(wanted, free=free)
@@ -289,7 +294,7 @@ class Live:
         words = self._last_frame.get("words", [])
         if self._session.is_channel_filling:
             words = ["a new channel starts: the clutch is open until its packets arrive", *words]
-        removed = self._session.removed_force()
+        removed = self._session.force_above_limit()
         if removed > _MIN_REMOVED_FORCE_N:
             words = [f"{removed:.1f} N are not rendered until the hand presses less", *words]
         if self._refusal:
@@ -298,10 +303,10 @@ class Live:
             "words": words,
             "device": "" if self._link is None else self._link.status_text(),
             "speed": round(self.pace.real_time_factor, 4),
-            "slow": self.pace.slow,
-            "factor": round(self.pace.real_time_factor * self.pace.slow, 3),
-            "late": round(1e3 * self.pace.lateness(), 1),
-            "lost": round(self.pace.given_up, 2),
+            "slow": self.pace.slowdown,
+            "factor": round(self.pace.real_time_factor * self.pace.slowdown, 3),
+            "late": round(1e3 * self.pace.lateness_p99_s(), 1),
+            "lost": round(self.pace.lost_time_s, 2),
             "state": self._state_name(),
             "driver": self._driver,
             "drive": self._drives,
@@ -336,7 +341,7 @@ class Live:
             raise CannotWrite(self._write_error)
 
 
-def _make_unused_folder(folder: Path) -> Path:
+def _unused_folder_path(folder: Path) -> Path:
     folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
@@ -358,18 +363,20 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     for kind in ("set", "rates"):
         values = message.get(kind)
         if isinstance(values, dict):
-            found[kind] = {name: value for name, value in values.items() if _is_finite(value)}
+            found[kind] = {
+                name: value for name, value in values.items() if _is_finite_number(value)
+            }
     if isinstance(message.get("pause"), bool):
         found["pause"] = message["pause"]
-    if _is_finite(message.get("slow")):
+    if _is_finite_number(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
-    if isinstance(message.get("scene"), str) and message["scene"] in SCENES:
+    if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
     found |= {name: True for name in ("reset", "drive") if message.get(name) is True}
     return found or None
 
 
-def _is_finite(value: Any) -> bool:
+def _is_finite_number(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

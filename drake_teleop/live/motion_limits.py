@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from drake_teleop.live.hand import LEAD_TIME_S
+from drake_teleop.live.hand import TARGET_LEAD_TIME_S
 from drake_teleop.live.inputs import ANGLE_UNIT_RAD, INPUT_RANGES, LENGTH_UNIT_M, Inputs
 
 _RATE_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
-_LEAD_TIMES_S = dict.fromkeys(("x", "y", "z"), LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
+_LEAD_TIMES_S = dict.fromkeys(("x", "y", "z"), TARGET_LEAD_TIME_S) | dict.fromkeys(
+    ("rx", "ry", "rz"), 0.0
+)
 # Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
 # limited only for a device; the path of a page's hand is smooth.
 _TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)

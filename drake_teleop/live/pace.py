@@ -16,12 +16,12 @@ class Pace:
     """Schedule of the simulation slices of `slice_s` simulated seconds; times `now` in s.
 
     Attributes:
-        slow: clock time per simulated time; 1: real time.
-        given_up: lost time that is not caught up [s].
+        slowdown: clock time per simulated time; 1: real time.
+        lost_time_s: lost time that is not caught up [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
-        self.slow, self.given_up = 1.0, 0.0
+        self.slowdown, self.lost_time_s = 1.0, 0.0
         self._slice = slice_s
         self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
@@ -37,11 +37,11 @@ class Pace:
     def begin_slice(self, now: float) -> None:
         late = now - self._due
         if late > _MAX_LATENESS_S:
-            self.given_up += late
+            self.lost_time_s += late
             self._due = now
         self._lateness.append(late)
         self._starts.append(now)
-        self._due += self._slice * self.slow
+        self._due += self._slice * self.slowdown
 
     @property
     def real_time_factor(self) -> float:
@@ -50,7 +50,7 @@ class Pace:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
-    def lateness(self) -> float:
+    def lateness_p99_s(self) -> float:
         """Return the 99 % quantile of the slices' lateness [s]."""
         return (
             sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0

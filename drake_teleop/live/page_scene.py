@@ -22,8 +22,8 @@ LogRows = dict[str, NDArray[np.float64]]
 _FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
 # Commands in base64 and their files in the static page of Meshcat.
-_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
-_FILE_PATTERN = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
+_MESHCAT_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
+_ASSET_PATTERN = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
@@ -42,18 +42,18 @@ class PageScene:
             with silence_drake_log():
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
-            self.objects = _extract_objects(meshcat.StaticHtml())
-            self._scene.canvas = _SceneRecorder()  # only this thread may destroy Meshcat
+            self.objects = _scene_objects_json(meshcat.StaticHtml())
+            self._scene.canvas = _ChangeRecorder()  # only this thread may destroy Meshcat
         except _FAILURE_EXCEPTIONS as error:
             self._report_failure(error)
 
-    def show(self, rows: LogRows) -> dict[str, Any]:
+    def frame_part(self, rows: LogRows) -> dict[str, Any]:
         """Return a message: poses (4x4, by columns) and sizes of the last row by Meshcat path."""
-        moves = {} if self.failure else self._scene_changes(rows)
+        moves = {} if self.failure else self._poses_and_sizes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
-    def _scene_changes(self, rows: LogRows) -> dict[str, Any]:
-        moves = _SceneRecorder()
+    def _poses_and_sizes(self, rows: LogRows) -> dict[str, Any]:
+        moves = _ChangeRecorder()
         try:
             self._scene.canvas = moves
             self._scene.show_sample(0.0, rows, -1)
@@ -68,7 +68,7 @@ class PageScene:
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
 
-class _SceneRecorder:
+class _ChangeRecorder:
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}
         self._sizes: dict[str, list[float]] = {}
@@ -87,8 +87,8 @@ class _SceneRecorder:
         return {"poses": dict(zip(self._poses, columns, strict=True)), "sizes": self._sizes}
 
 
-def _extract_objects(html: str) -> bytes:
-    commands = _COMMAND_PATTERN.findall(html)
+def _scene_objects_json(html: str) -> bytes:
+    commands = _MESHCAT_COMMAND_PATTERN.findall(html)
     if not commands:
         raise ValueError("the static page of Drake's Meshcat has an unknown format")
-    return json.dumps({"commands": commands, "files": dict(_FILE_PATTERN.findall(html))}).encode()
+    return json.dumps({"commands": commands, "files": dict(_ASSET_PATTERN.findall(html))}).encode()

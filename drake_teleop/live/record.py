@@ -8,9 +8,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from importlib import import_module
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 from pydrake.systems.analysis import Simulator
 
@@ -41,7 +43,7 @@ def versions_and_digest(scenario: Scenario) -> dict[str, str]:
     return versions | {"files": digest.hexdigest()[:12]}
 
 
-class Record:
+class SessionRecord:
     """Writer of scenario, load and inputs of a live session into a folder."""
 
     def __init__(
@@ -113,7 +115,7 @@ class BackgroundLog(LogOnDisk):
     ) -> None:
         super().__init__(folder, simulator, start, form)
         self._thread = ThreadPoolExecutor(1, "log of a drive")
-        self._writing: Future[None] = self._thread.submit(_import_polars)
+        self._writing: Future[Any] = self._thread.submit(import_module, "polars")
 
     def finish(self) -> None:
         self._writing.result()
@@ -121,7 +123,3 @@ class BackgroundLog(LogOnDisk):
     def _write_part(self, part: SimulationResult) -> None:
         self.finish()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
-
-
-def _import_polars() -> None:
-    import polars  # noqa: F401

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
@@ -21,8 +21,6 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Payload
-
-Array = NDArray[np.float64]
 
 #: Gripped object, if the scenario has no payload.
 DEFAULT_OBJECT = Payload(mass=0.8)
@@ -40,7 +38,7 @@ _SCENARIO_OF_SCENE = {
     "wall": "touch",
     "block": "push_block",
 }
-SCENES = ("own", *_SCENARIO_OF_SCENE)
+SCENE_NAMES = ("own", *_SCENARIO_OF_SCENE)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -64,7 +62,7 @@ def with_task_space_device(scenario: Scenario) -> Scenario:
 
 
 def load_scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENES`; `own` is the user's scenario."""
+    """Return the scenario of a scene in `SCENE_NAMES`; `own` is the user's scenario."""
     if name == "own":
         return own
     scenario = LoadScenario(_SCENARIO_OF_SCENE[name])
@@ -100,7 +98,8 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
-    if not (inputs.detection and _has_noise_floor(load, inputs)):
+    has_noise_floor = load is not None and load.noise_floor is not None and inputs.sensor == 0
+    if not (inputs.detection and has_noise_floor):
         changes["contact_detection"] = None
     elif scenario.contact_detection is None:
         changes["contact_detection"] = ContactDetectionConfig()
@@ -113,10 +112,6 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         gripper = load.identification.phi - has_payload * _payload_phi(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
-
-
-def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
-    return load is not None and load.noise_floor is not None and inputs.sensor == 0
 
 
 def _payload_phi(scenario: Scenario) -> Array:

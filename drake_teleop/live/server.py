@@ -37,12 +37,17 @@ from drake_teleop.common.files import make_folder
 from drake_teleop.common.html import content_security_policy
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceConnection
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenarios import SCENES, live_scenario, load_scene, with_task_space_device
+from drake_teleop.live.scenarios import (
+    SCENE_NAMES,
+    live_scenario,
+    load_scene,
+    with_task_space_device,
+)
 from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
@@ -50,11 +55,11 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 _HOST = "127.0.0.1"
 _MAX_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_LOOP_ITERATIONS = 3
+_LOOP_ITERATIONS_PER_TICK = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
-_CLOSE_TIMEOUT_S, _END_TIMEOUT_S = 1.0, 4.0
-_DEVICE_CONDITIONS = ("", " or until the device sends")
+_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
+_WAIT_CONDITION_ENDINGS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -107,12 +112,12 @@ class LiveDrive:
 
     def _make_scenes(self, scenario: Scenario, device: bool, progress: UpdateProgress) -> None:
         self._scene_scenarios: dict[str, Scenario] = {}
-        for name in SCENES:
+        for name in SCENE_NAMES:
             setup = load_scene(name, scenario)
             self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
             self._views[name] = PageScene(name, self._scene_scenarios[name])
-            progress(len(self._views) / (1 + len(SCENES)))
-        warm_up(scenario, self._load, device)
+            progress(len(self._views) / (1 + len(SCENE_NAMES)))
+        compile_session_functions(scenario, self._load, device)
         progress(1.0)
 
     def wait(self) -> None:
@@ -150,14 +155,17 @@ class LiveDrive:
     def _stop_threads(self) -> None:
         """Stop all threads; Python may crash at exit while compiled code runs."""
         self._stop.set()
-        end = time.monotonic() + _END_TIMEOUT_S
+        end = time.monotonic() + _THREAD_END_TIMEOUT_S
         for thread in self._threads:
             while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
                 with contextlib.suppress(KeyboardInterrupt):
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            print(f"error: drive: does not end within {_END_TIMEOUT_S:g} s{lost}", file=sys.stderr)
+            print(
+                f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}",
+                file=sys.stderr,
+            )
             sys.stdout.flush()
             os._exit(2)
 
@@ -177,7 +185,7 @@ class LiveDrive:
             self._ready.set()
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
-        show = self._views[SCENES[0]].show
+        show = self._views[SCENE_NAMES[0]].frame_part
         link = None if self._device is None else self._device.link
         live = Live(scenario, self._load, record, show, time.perf_counter(), link)
         self.recorded = live.recorded
@@ -232,7 +240,7 @@ class LiveDrive:
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
-                    _print_note(f"a packet of the device was refused: it {refusal}")
+                    _print_to_stderr(f"a packet of the device was refused: it {refusal}")
                 await self._sleep_until_tick()
 
     async def _sleep_until_tick(self) -> None:
@@ -240,7 +248,7 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.time_to_next_tick(time.perf_counter()))
-        for _ in range(_LOOP_ITERATIONS):
+        for _ in range(_LOOP_ITERATIONS_PER_TICK):
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
@@ -248,12 +256,12 @@ class LiveDrive:
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
         scenario, show = (
             self._scene_scenarios[live.requested_scene],
-            self._views[live.requested_scene].show,
+            self._views[live.requested_scene].frame_part,
         )
 
         def identify() -> None:
             try:
-                found.set_result(_identify_load(scenario, self._raise_when_stopped))
+                found.set_result(_identify_load(scenario, self._start_stoppable_stage))
             except Exception as error:
                 found.set_exception(error)
 
@@ -271,7 +279,7 @@ class LiveDrive:
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello_text(page))
 
-    def _raise_when_stopped(self, name: str) -> UpdateProgress:
+    def _start_stoppable_stage(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the live session was stopped")
@@ -332,9 +340,9 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _print_note(
+                _print_to_stderr(
                     "no page is open: the simulation waits"
-                    + _DEVICE_CONDITIONS[self._device is not None]
+                    + _WAIT_CONDITION_ENDINGS[self._device is not None]
                 )
 
 
@@ -345,9 +353,11 @@ def _identify_load(scenario: Scenario, progress: bool | StartStage) -> Identifie
     return identified_load(dataclasses.replace(scenario, contact_detection=detection), progress)
 
 
-def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
+def compile_session_functions(
+    scenario: Scenario, load: IdentifiedLoad | None, device: bool
+) -> None:
     """Compile the functions of the first simulation slices, which takes a minute once."""
-    session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
+    session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.page_values(session.new_rows(), session.inputs)
         session.apply_inputs(session.inputs.with_changes({"z": z}))
@@ -408,7 +418,7 @@ def run_drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
+    print(f"drive it at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it", flush=True)
     reason = live.wait_for_signal()
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
@@ -417,10 +427,12 @@ def run_drive_command(
         raise DrakeTeleopError(f"the simulation has stopped: {live.ended}", where="drive")
 
 
-def start_condition(device: str | None) -> str:
+def start_condition_text(device: str | None) -> str:
     """Return as text what starts the waiting simulation."""
-    return "the simulation waits until this page is open" + _DEVICE_CONDITIONS[device is not None]
+    return (
+        "the simulation waits until this page is open" + _WAIT_CONDITION_ENDINGS[device is not None]
+    )
 
 
-def _print_note(text: str) -> None:
+def _print_to_stderr(text: str) -> None:
     print(text, file=sys.stderr, flush=True)

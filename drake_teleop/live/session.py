@@ -26,7 +26,7 @@ from drake_teleop.live.record import (
     LOAD_FILE,
     SCENARIO_FILE,
     BackgroundLog,
-    Record,
+    SessionRecord,
     versions_and_digest,
 )
 from drake_teleop.live.scenarios import (
@@ -55,12 +55,12 @@ _ROWS_PER_LOG_PART = 2000
 _SCALE_RAMP_S = 0.05
 # Shortest step of error control [s], for real time in contact. A third-order step is stable for
 # vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
-_MIN_STEP_S = 2.5e-4
+_MIN_INTEGRATION_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
-_MAX_FORCE_RISE_N = 0.9
+_MAX_CHANNEL_CHANGE_FORCE_RISE_N = 0.9
 # Duration of short steps after a rejected one [s].
-_SHORT_STEPS_TIME_S = 4e-3
-_NO_EVENT = EventStatus.DidNothing()
+_SHORT_STEPS_DURATION_S = 4e-3
+_NO_EVENT_STATUS = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
@@ -74,21 +74,21 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     station: Any = weakref.ref(simulator)
     rejected, until = 0, math.inf
 
-    def after_step(context: Context) -> EventStatus:
+    def set_step_mode(context: Context) -> EventStatus:
         nonlocal rejected, until
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
-            rejected, until = number, context.get_time() + _SHORT_STEPS_TIME_S
+            rejected, until = number, context.get_time() + _SHORT_STEPS_DURATION_S
             integrator.set_maximum_step_size(shortest)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
             until = math.inf
             integrator.set_maximum_step_size(longest)
             integrator.set_fixed_step_mode(False)
-        return _NO_EVENT
+        return _NO_EVENT_STATUS
 
-    simulator.set_monitor(after_step)
+    simulator.set_monitor(set_step_mode)
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
@@ -124,7 +124,7 @@ class _Station:
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
         if scenario.simulation.integrator == "runge_kutta3":  # has error control
-            take_short_steps_in_contact(self.simulator, _MIN_STEP_S)
+            take_short_steps_in_contact(self.simulator, _MIN_INTEGRATION_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
         self.columns = log_slices_of_signals(self.station)
@@ -156,7 +156,9 @@ class _Station:
         rendered = other.signal_value("force_to_master")
         cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
         if new_channel:
-            cross_fade.LimitForce(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
+            cross_fade.LimitForce(
+                context, _MAX_CHANNEL_CHANGE_FORCE_RISE_N + float(np.linalg.norm(rendered[:3]))
+            )
         impedances = other.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
             hand, context = self.block_and_context("live_hand")
@@ -200,9 +202,9 @@ class Session:
         self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
         self._station = _Station(scenario, estimate, load, 0, device=device)
-        self._record: Record | None = None
+        self._record: SessionRecord | None = None
         if record is not None:
-            self._record = Record(record, scenario, load, self.inputs, device=device)
+            self._record = SessionRecord(record, scenario, load, self.inputs, device=device)
         self._on_disk: BackgroundLog | None = None
         if log is not None:
             self._on_disk = BackgroundLog(log, self._station.simulator, 0.0, add_missing_signals)
@@ -290,18 +292,18 @@ class Session:
 
     def inputs_at_stylus(self) -> Inputs:
         """Return the inputs of a hand that takes the stylus at its present pose."""
-        return self.inputs.with_held_pose(self._station.signal_value("pose_master"), self._start)
+        return self.inputs.with_hand_at_pose(self._station.signal_value("pose_master"), self._start)
 
     def device_wrench(self) -> NDArray[np.float64]:
         """Return the wrench (6,) for the haptic device [N, N m]."""
         return self._station.signal_value("force_to_master")
 
-    def removed_force(self) -> float:
+    def force_above_limit(self) -> float:
         """Return the force [N] that the force limit after a channel change removes."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block_and_context("cross_fade")
-        return float(cross_fade.removed_force(context))
+        return float(cross_fade.force_above_limit(context))
 
     def write_log(self) -> None:
         if self._record is not None:
@@ -330,7 +332,7 @@ class Session:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class RecordedDrive:
     """Recorded live session.
 
     Attributes:
@@ -359,7 +361,7 @@ class Drive:
         return session.log() if log is None else SimulationResult.scan_parquet(log)
 
 
-def read_drive(folder: str | Path) -> Drive:
+def read_drive(folder: str | Path) -> RecordedDrive:
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO_FILE)
     changes = read_inputs(folder / INPUTS_FILE, versions_and_digest(scenario))
@@ -372,4 +374,4 @@ def read_drive(folder: str | Path) -> Drive:
             remedy="record the session again",
         )
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
-    return Drive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)
+    return RecordedDrive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

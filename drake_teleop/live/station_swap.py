@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -20,8 +19,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 #: Blocks whose parameters change during a live session.
 _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
@@ -137,7 +135,7 @@ class CrossFade(LeafSystem):
         """Limit the force to `most` [N] until the new wrench is at most that large."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
-    def removed_force(self, context: Context) -> float:
+    def force_above_limit(self, context: Context) -> float:
         """Return the force [N] by which `LimitForce` reduces the wrench; 0 during a cross-fade."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force_norm(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0

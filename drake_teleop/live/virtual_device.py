@@ -13,21 +13,21 @@ _STEPS_PER_MS = 10  # per ms
 class VirtualDevice:
     """Simulated device of given mass [kg] and damping [N s/m] in a moving hand.
 
-    `hand` maps time [s] to intended position [m] and velocity [m/s]; `energy` is the work of
-    device and hand against the rendered force [J].
+    `hand_motion` maps time [s] to intended position [m] and velocity [m/s]; `energy` is the work
+    of device and hand against the rendered force [J].
     """
 
     def __init__(
         self,
-        hand: Callable[[float], tuple[Sequence[float], Sequence[float]]],
+        hand_motion: Callable[[float], tuple[Sequence[float], Sequence[float]]],
         grip: str = "medium",
         mass: float = 0.15,
         damping: float = 0.5,
     ) -> None:
         held = GRIP_IMPEDANCES[grip]
-        self._hand, self._b = hand, damping
+        self._hand, self._b = hand_motion, damping
         self._mass, self._k, self._d = mass + held.mass, held.stiffness, held.damping
-        self.position, self.velocity = list(map(float, hand(0.0)[0])), [0.0, 0.0, 0.0]
+        self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
         self.energy, self._t = 0.0, 0.0
 
     def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
@@ -51,7 +51,7 @@ def tapping_motion(
     """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
     lift, hold = 0.01, 0.6
 
-    def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
+    def hand_motion(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)
         if phase < way:
             s, rate = phase / way, 1.0
@@ -63,4 +63,4 @@ def tapping_motion(
         far = depth + lift
         return (0.0, 0.0, lift - far * smooth), (0.0, 0.0, -far * slope)
 
-    return hand
+    return hand_motion

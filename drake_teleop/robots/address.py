@@ -36,7 +36,7 @@ class Address:
     def optional_parameter(self, name: str) -> str | None:
         return self._parameters.get(name)
 
-    def read_numbers(self, name: str, count: int) -> list[float] | None:
+    def positive_numbers(self, name: str, count: int) -> list[float] | None:
         text = self._parameters.get(name)
         if text is None:
             return None
@@ -52,7 +52,7 @@ class Address:
             )
         return values
 
-    def read_word(self, name: str, among: tuple[str, ...]) -> str:
+    def chosen_word(self, name: str, among: tuple[str, ...]) -> str:
         """Return a parameter, one of the words `among` (default: the first)."""
         text = self._parameters.get(name, among[0])
         if text not in among:

@@ -23,11 +23,16 @@ from drake_teleop.logs.read.alignment import (
     smoother_weights,
     vectors_of_skew_parts,
 )
-from drake_teleop.robots.compensator import CLOCK_DRIFT, CLOCK_JUMP_S, MAX_OFFSET_DRIFT, STALE_AGE_S
+from drake_teleop.robots.compensator import (
+    CLOCK_JUMP_S,
+    MAX_CLOCK_DRIFT,
+    MAX_SENSOR_OFFSET_DRIFT,
+    STALE_AGE_S,
+)
 from drake_teleop.robots.streams import (
     IMU,
     JOINTS,
-    NUM_VALUES,
+    NUM_READING_VALUES,
     POSE,
     WRENCH,
     Part,
@@ -35,9 +40,9 @@ from drake_teleop.robots.streams import (
     Reading,
     ReadingFlag,
 )
-from drake_teleop.robots.watch import MODEL_ERROR_FRACTION, unfiltered_noise
+from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, unfiltered_noise
 
-DELAY_FADE_TIME_S = 10.0
+DELAY_FORGETTING_TIME_S = 10.0
 """Time constant of the weights [s]."""
 MAX_DELAY_STD_S = 5e-4
 """Maximum standard deviation of a usable estimate [s]."""
@@ -45,15 +50,15 @@ MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
-INITIAL_DELAY_ERROR_S = 0.03
+MAX_INITIAL_DELAY_ERROR_S = 0.03
 """Delay error that the residual of a sample may contain before the delay is known [s]."""
-TRACKING_DELAY_ERROR_S = 0.004
+MAX_TRACKED_DELAY_ERROR_S = 0.004
 """Delay error in a residual once the delay is known, besides the remaining correction [s]."""
 DELAY_SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
-_OUTLIER_SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
+_MAX_NOISE_SIGMAS, _MIN_DELAY_SAMPLES = 5.0, 50  # samples before offsets are estimated
 
-Motion = tuple[float, Array]
+TimedMotion = tuple[float, Array]
 """Time [s], and s, omega, alpha (9,)."""
 
 
@@ -67,51 +72,58 @@ class DelayTracker:
         self._phi, self._noise = tuple(usable_phi(load)[0]), unfiltered_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
-        self._reset(-math.inf)
+        self._reset_estimate(-math.inf)
         self.update_delay((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
-        self._reset(-math.inf)  # the call above loads compiled code before the first sample
+        self._reset_estimate(
+            -math.inf
+        )  # the call above loads compiled code before the first sample
 
-    def _reset(self, t: float) -> None:
+    def _reset_estimate(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
-        self._delay_error = INITIAL_DELAY_ERROR_S
+        self._delay_error = MAX_INITIAL_DELAY_ERROR_S
 
-    def update_delay(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
+    def update_delay(
+        self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
+    ) -> None:
         """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:
             return
         # Another clock, or no explained sample for long.
-        if not 0.0 <= t - self._fitted < DELAY_FADE_TIME_S:
-            self._reset(t)
+        if not 0.0 <= t - self._fitted < DELAY_FORGETTING_TIME_S:
+            self._reset_estimate(t)
             elapsed = 0.0
         self._t = t
         for row, (_, motion) in zip(self._wrenches, (at, before, after), strict=True):
             non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], self._phi, row)
         slope = (self._wrenches[2] - self._wrenches[1]) / step
         residual = wrench - self._wrenches[0]
-        if self._is_explained(residual, slope):
+        if self._is_inlier(residual, slope):
             # The sums refer to zero delay; the motion is already shifted by the present one.
             residual = residual + slope * self.delay_s
-            fade = math.exp(-(t - self._fitted) / DELAY_FADE_TIME_S)
+            fade = math.exp(-(t - self._fitted) / DELAY_FORGETTING_TIME_S)
             self._fitted, self._samples = t, self._samples + 1
             self._count = fade * self._count + 1.0
             products = slope, residual, slope * slope, slope * residual, residual * residual
             self._sums = fade * self._sums + np.stack(products)
-            self._slew_delay(min(elapsed, DELAY_FADE_TIME_S))
+            self._slew_delay(min(elapsed, DELAY_FORGETTING_TIME_S))
 
-    def _is_explained(self, residual: Array, slope: Array) -> bool:
-        starting = self._samples < _MIN_SAMPLES
-        limit = _OUTLIER_SIGMAS * self._noise + self._delay_error * np.abs(slope)
-        limit += MODEL_ERROR_FRACTION * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT
+    def _is_inlier(self, residual: Array, slope: Array) -> bool:
+        starting = self._samples < _MIN_DELAY_SAMPLES
+        limit = _MAX_NOISE_SIGMAS * self._noise + self._delay_error * np.abs(slope)
+        limit += (
+            LOAD_WRENCH_ERROR_FRACTION * np.abs(self._wrenches[0])
+            + starting * MAX_SENSOR_OFFSET_DRIFT
+        )
         offsets = self._offsets
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
 
     def _slew_delay(self, elapsed: float) -> None:
-        if self._samples < _MIN_SAMPLES:
+        if self._samples < _MIN_DELAY_SAMPLES:
             return
         g, r, gg, gr, rr = self._sums / self._count
         information = float(self._weights @ (gg - g * g))
@@ -120,19 +132,21 @@ class DelayTracker:
         estimate = float(self._weights @ (gr - g * r)) / information
         rest = rr - r * r - estimate * (gr - g * r)
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
-        self._delay_error = INITIAL_DELAY_ERROR_S
+        self._delay_error = MAX_INITIAL_DELAY_ERROR_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
             max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
-            self._delay_error = min(INITIAL_DELAY_ERROR_S, TRACKING_DELAY_ERROR_S + abs(correction))
+            self._delay_error = min(
+                MAX_INITIAL_DELAY_ERROR_S, MAX_TRACKED_DELAY_ERROR_S + abs(correction)
+            )
 
 
 _GRAVITY_W = np.array([0.0, 0.0, -9.81])
 IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
 """Identity: the sensor's frame is the posed frame."""
 _BUFFER_TIME_S = 0.5  # buffer of motions and wrenches
-_MIN_DT_S, _MAX_TIME_S, _MAX_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
+_MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
 _PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
@@ -172,7 +186,7 @@ class PartStreams:
             self._motion.close()
 
 
-class SensorPoseOfJoints(Protocol):
+class ArmKinematics(Protocol):
     """Interface of an arm's kinematics, such as `station.slave.plant.Arm`."""
 
     @property
@@ -183,10 +197,10 @@ class SensorPoseOfJoints(Protocol):
         """Return the sensor's pose X_WS (7,) at joint positions q (n,): [w x y z, position]."""
 
 
-class PosedByJoints:
+class PoseSourceFromJoints:
     """Source that converts joint positions to poses of the sensor frame S."""
 
-    def __init__(self, source: PartSource, arm: SensorPoseOfJoints) -> None:
+    def __init__(self, source: PartSource, arm: ArmKinematics) -> None:
         self._source, self._arm, self.dt = source, arm, source.dt
         others = (stream for stream in source.streams if stream not in (JOINTS, POSE))
         self.streams: tuple[str, ...] = (*others, POSE)
@@ -238,16 +252,16 @@ class MotionWindow:
             self._size = self._weights.shape[1]
             self.reset()
 
-    def add_part(self, part: Part, now: float) -> list[tuple[float, Array]]:
+    def motions_completed_by(self, part: Part, now: float) -> list[tuple[float, Array]]:
         """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
-        row = self._motion_sample(part)
+        row = self._row_of_valid_part(part)
         if row is None:
             return []
         last = self._last
         step = math.inf if last is None else part.t - last[0]
         if step <= 0.0 and now - self._arrival <= STALE_AGE_S:
             return []  # out of order or repeated
-        if not self._dt and _MIN_DT_S <= step <= STALE_AGE_S:
+        if not self._dt and _MIN_MOTION_PERIOD_S <= step <= STALE_AGE_S:
             self._measure_period(step)
         if self._last is None or not 0.0 < step <= STALE_AGE_S:
             self.reset()
@@ -264,9 +278,11 @@ class MotionWindow:
             self._next_t += self._dt
         return found
 
-    def _motion_sample(self, part: Part) -> Array | None:
+    def _row_of_valid_part(self, part: Part) -> Array | None:
         values = part.values
-        if part.flags or not (abs(part.t) < _MAX_TIME_S and (np.abs(values) < _MAX_VALUE).all()):
+        if part.flags or not (
+            abs(part.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
+        ):
             return None
         if part.stream == IMU:
             return values
@@ -301,12 +317,12 @@ class _ClockOffset:
 
     def update(self, t: float, now: float) -> None:
         if math.isfinite(t):
-            ahead, faded = now - t, self.offset + CLOCK_DRIFT * (now - self._now)
+            ahead, faded = now - t, self.offset + MAX_CLOCK_DRIFT * (now - self._now)
             known = abs(ahead - self.offset) <= CLOCK_JUMP_S
             self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 
-class Assembly:
+class ReadingAssembler:
     """Source of readings: wrenches with the motion of another stream at the same time.
 
     Args:
@@ -351,9 +367,11 @@ class Assembly:
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None
-        return [reading for part, now in arrived for reading in self.complete_readings(part, now)]
+        return [
+            reading for part, now in arrived for reading in self.readings_completed_by(part, now)
+        ]
 
-    def complete_readings(self, part: Part, now: float) -> list[Reading]:
+    def readings_completed_by(self, part: Part, now: float) -> list[Reading]:
         """Add a part received at `now` [s]; return the readings that became complete."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
@@ -363,15 +381,15 @@ class Assembly:
             shift = -self.delay_s
             if self._parts.two_clocks:
                 shift += self._clocks[1].offset - self._clocks[0].offset
-            for t, motion in self._window.add_part(part, now):
-                self._add_motion(t + shift, motion)
+            for t, motion in self._window.motions_completed_by(part, now):
+                self._store_motion(t + shift, motion)
         found = []
-        while self._pending and (reading := self._make_reading(self._pending[0])) is not None:
+        while self._pending and (reading := self._complete_reading(self._pending[0])) is not None:
             self._pending.popleft()
             found.append(reading)
         return found
 
-    def _add_motion(self, t: float, motion: Array) -> None:
+    def _store_motion(self, t: float, motion: Array) -> None:
         motions = self._motions
         if motions and not motions[-1][0] - STALE_AGE_S < t < motions[-1][0] + _BUFFER_TIME_S:
             motions.clear()  # another clock: wrenches on the old one would wait forever
@@ -382,8 +400,8 @@ class Assembly:
             while t - motions[0][0] > _BUFFER_TIME_S:
                 motions.popleft()
 
-    def _make_reading(self, part: Part) -> Reading | None:
-        values, flags, motions = np.zeros(NUM_VALUES), part.flags, self._motions
+    def _complete_reading(self, part: Part) -> Reading | None:
+        values, flags, motions = np.zeros(NUM_READING_VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):
             return Reading(part.number, part.t, values, flags)

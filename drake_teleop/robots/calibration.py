@@ -31,9 +31,9 @@ from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.recording import SampleRecorder
 from drake_teleop.robots.streams import Source
 
-CONFIDENCE = 0.9998
+REQUIRED_CONFIDENCE = 0.9998
 """Level of the interval that must be within the tolerance."""
-RECORD_GROWTH = 1.12
+RECORD_GROWTH_FACTOR = 1.12
 """Growth factor of the record from one result to the next."""
 FIRST_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
@@ -43,37 +43,36 @@ _RESTART_ADVICE = "start again: the record has another zero or another load from
 _GRAVITY_M_S2 = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
 _INITIAL_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
-_INITIAL_NOISE = np.repeat([0.25, 0.012], 3)
+_INITIAL_NOISE_STD = np.repeat([0.25, 0.012], 3)
 _REGULARIZATION = 1e-12  # relative information that keeps matrices regular
 # Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _ADVISED_MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
     ("swing the wrist about {axis}, briskly, by 20 deg back and forth", np.radians(20.0), 1.5),
 )
-_MOTION_S, _MOTION_SAMPLES = 4.0, 80
+_ADVISED_MOTION_S, _ADVISED_MOTION_SAMPLES = 4.0, 80
 # Independent samples per second and hertz of the low-pass.
 _INDEPENDENT_RATE_PER_HZ = 2.2
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class RecordEvaluation:
     """Intermediate result of a calibration, for the k parameters with a tolerance.
 
     Attributes:
-        t: length of the record [s].
-        found: the identification; None if it failed for the reason `why`.
-        half: (k,) half-widths of the 95 % intervals, divided by the tolerances.
-        sure: (k,) True where the interval of level `CONFIDENCE` is within the tolerance.
-        known: (k,) True where the previous result was `sure`, too.
+        identified_log: the identification; None if it failed for the reason `failure`.
+        relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
+        is_within_tolerance: (k,) True where the interval of level `REQUIRED_CONFIDENCE` is.
+        is_known: (k,) True where the previous result was within the tolerance, too.
         doubts: problems of the record; no parameter is known then.
     """
 
-    t: float
-    found: IdentifiedLog | None
-    why: str
-    half: Array
-    sure: NDArray[np.bool_]
-    known: NDArray[np.bool_]
+    record_length_s: float
+    identified_log: IdentifiedLog | None
+    failure: str
+    relative_half_widths: Array
+    is_within_tolerance: NDArray[np.bool_]
+    is_known: NDArray[np.bool_]
     doubts: tuple[str, ...]
     advice: str
 
@@ -81,11 +80,11 @@ class Evaluation:
 def evaluate_record(
     path: Path,
     tolerance: Tolerance,
-    previous: Evaluation | None,
+    previous: RecordEvaluation | None,
     *,
     cutoff_hz: float | None,
     delay: str | float,
-) -> Evaluation:
+) -> RecordEvaluation:
     """Identify a record's load; compare its uncertainty with the tolerance."""
     count, found, why = len(tolerance.required_entries), None, ""
     try:
@@ -94,15 +93,15 @@ def evaluate_record(
         why = str(error)
     half, sure = np.full(count, np.inf), np.zeros(count, bool)
     doubts: tuple[str, ...] = ()
-    phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE, None
+    phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE_STD, None
     if found is not None:
         load, log = found.identification, found.log
-        half, wider, degrees = interval_half_widths(found, tolerance)
+        half, wider, degrees = half_widths_over_tolerances(found, tolerance)
         doubts = record_problems(found)
         sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
-            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE)
-    known = sure & (previous is not None and previous.sure)
+            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE_STD)
+    known = sure & (previous is not None and previous.is_within_tolerance)
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGE_CAUSES] if found else []
     with suppress(DrakeTeleopError):  # too few samples
         log = log or low_pass_log(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
@@ -117,17 +116,21 @@ def evaluate_record(
             log.motion, log.dt, cutoff_hz, derivatives_over_tolerances(tolerance, phi), noise
         )
     t = 0.0 if log is None else float(log.t[-1])
-    return Evaluation(t, found, why, half, sure, known, doubts, advice)
+    return RecordEvaluation(t, found, why, half, sure, known, doubts, advice)
 
 
-def interval_half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return half-widths over tolerances (95 %, `CONFIDENCE`), degrees of freedom: (k,) each."""
+def half_widths_over_tolerances(
+    found: IdentifiedLog, tolerance: Tolerance
+) -> tuple[Array, Array, Array]:
+    """Return (k,) each: half-widths (95 %, `REQUIRED_CONFIDENCE`), degrees of freedom."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
-    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, CONFIDENCE))
+    half, sure = (
+        stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, REQUIRED_CONFIDENCE)
+    )
     return half, sure, degrees
 
 
@@ -159,7 +162,7 @@ def advise_motion(
     gram = gram + _REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
-    for words, of_motion in _candidate_motions(last, noise, rate):
+    for words, of_motion in _candidate_information_matrices(last, noise, rate):
         left = deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
@@ -167,9 +170,11 @@ def advise_motion(
     return best
 
 
-def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
+def _candidate_information_matrices(
+    up: Array, noise: Array, rate: float
+) -> Iterator[tuple[str, Array]]:
     s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)
-    t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
+    t = np.arange(_ADVISED_MOTION_SAMPLES) * (_ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES)
     for words, size, hertz in _ADVISED_MOTIONS:
         w = 2.0 * np.pi * hertz
         angle, speed = 0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t)
@@ -183,43 +188,43 @@ def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[s
                 + np.outer(1.0 - np.cos(angle), e * (e @ s0))
             )
             V = regressor(s, np.outer(speed, e), np.outer(change, e))
-            rows = np.concatenate([np.tile(np.eye(6), (_MOTION_SAMPLES, 1, 1)), V], axis=2)
+            rows = np.concatenate([np.tile(np.eye(6), (_ADVISED_MOTION_SAMPLES, 1, 1)), V], axis=2)
             rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
-            share = rate * _MOTION_S / _MOTION_SAMPLES
+            share = rate * _ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES
             yield words.format(axis=axis), share * (rows.T @ rows)
 
 
 DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _READ_TIMEOUT_S = 0.05
-_T = TypeVar("_T")
+_SampleT = TypeVar("_SampleT")
 
 
 def calibrate(
-    source: Source[_T],
-    recorder: SampleRecorder[_T],
+    source: Source[_SampleT],
+    recorder: SampleRecorder[_SampleT],
     path: Path,
     tolerance: Tolerance,
     *,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     seconds: float = 120.0,
-    show: Callable[[Evaluation], None] = lambda _: None,
-) -> list[Evaluation]:
+    show: Callable[[RecordEvaluation], None] = lambda _: None,
+) -> list[RecordEvaluation]:
     """Record a stream until the tolerance is met, the source ends or the time is over."""
-    results: list[Evaluation] = []
+    results: list[RecordEvaluation] = []
     next_length_s = FIRST_RECORD_S
-    earlier = [path.with_name(name) for name in recorder.files] if source.live else []
-    pending: Future[Evaluation] | None = None
+    earlier = [path.with_name(name) for name in recorder.file_names] if source.live else []
+    pending: Future[RecordEvaluation] | None = None
 
-    def evaluate() -> Evaluation:
+    def evaluate() -> RecordEvaluation:
         previous = results[-1] if results else None
         return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
 
-    def finish(result: Evaluation) -> bool:
+    def finish(result: RecordEvaluation) -> bool:
         results.append(result)
         show(result)
-        return bool(result.known.all())
+        return bool(result.is_known.all())
 
     def write_record() -> None:
         if recorder.longest_part_s:
@@ -236,7 +241,9 @@ def calibrate(
                 for sample in samples:
                     recorder.add(sample)
                     if pending is None and recorder.longest_part_s >= next_length_s:
-                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.longest_part_s)
+                        next_length_s = max(
+                            FIRST_RECORD_S, RECORD_GROWTH_FACTOR * recorder.longest_part_s
+                        )
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
@@ -250,7 +257,7 @@ def calibrate(
         raise
     if pending is not None:
         finish(pending.result())
-    if not results or not results[-1].known.all():
+    if not results or not results[-1].is_known.all():
         write_record()
         finish(evaluate())
     return results

@@ -20,23 +20,30 @@ from drake_teleop.logs.causes.instants import S, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
-from drake_teleop.robots.streams import NONZERO_FLAGS, NUM_VALUES, Reading, ReadingFlag
+from drake_teleop.robots.streams import (
+    NONZERO_WRENCH_FLAGS,
+    NUM_READING_VALUES,
+    Reading,
+    ReadingFlag,
+)
 
 RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_WATCH_FLAGS, _INVALID_FLAGS = (
+_TRIGGER_FLAGS, _INVALID_FLAGS = (
     int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD),
-    ~int(NONZERO_FLAGS),
+    ~int(NONZERO_WRENCH_FLAGS),
 )
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
-_MAX_RETRY_S, _END_S, _SAME_CHANGE_S = 10.0, 1.0, 1.0
+_MAX_TEST_SPACING_S, _MIN_UNFLAGGED_TIME_S, _MIN_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_RECORD_S, _MIN_LIKELIHOOD_RATIO = 4.0, 40.0
-_MIN_FORCE_STD = 0.5  # m/s^2, minimum standard deviation of the specific force after a change
-_NICENESS, _TIMEOUT_S = 10, 60.0
+_MIN_SPECIFIC_FORCE_STD = (
+    0.5  # m/s^2, minimum standard deviation of the specific force after a change
+)
+_PROCESS_NICENESS, _TEST_TIMEOUT_S = 10, 60.0
 
-ReportedChange = tuple[float, str]
+TimedChangeText = tuple[float, str]
 """Time of a change [s], and the change in words."""
 
 
@@ -45,11 +52,11 @@ class ChangeMonitor:
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
-        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_VALUES))
+        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_READING_VALUES))
         self._count, self._last = 0, -math.inf
         self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
         self._executor = ThreadPoolExecutor(1, "changes of a stream")
-        self._pending: Future[list[ReportedChange]] | None = None
+        self._pending: Future[list[TimedChangeText]] | None = None
         self._reported: list[float] = []
 
     def add_reading(self, reading: Reading, flags: int) -> None:
@@ -61,15 +68,15 @@ class ChangeMonitor:
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
         self._count += 1
-        if flags & _WATCH_FLAGS:
+        if flags & _TRIGGER_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
                 self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S
-        elif t - self._last_flagged > _END_S:
+        elif t - self._last_flagged > _MIN_UNFLAGGED_TIME_S:
             self._flagged_since = math.inf
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
             self._next_attempt = t + min(
-                max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since)), _MAX_RETRY_S
+                max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since)), _MAX_TEST_SPACING_S
             )
             find = _find_changes_in_process if self._live else find_changes
             self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
@@ -89,31 +96,31 @@ class ChangeMonitor:
             return self._rows[: self._count].copy()
         return np.concatenate([self._rows[first:], self._rows[:first]])
 
-    def _report_changes(self, found: Future[list[ReportedChange]]) -> None:
+    def _report_changes(self, found: Future[list[TimedChangeText]]) -> None:
         error = found.exception()
         if error is not None:  # the loop continues
             self._report(f"the test for a tare or another load failed ({error})")
             return
         for time, words in found.result():
-            if all(abs(time - t) > _SAME_CHANGE_S for t in self._reported):
+            if all(abs(time - t) > _MIN_CHANGE_SPACING_S for t in self._reported):
                 self._reported.append(time)
-                self._next_attempt = self._last + _MAX_RETRY_S
+                self._next_attempt = self._last + _MAX_TEST_SPACING_S
                 self._report(words)
 
 
-def _find_changes_in_process(rows: Array, dt: float) -> list[ReportedChange]:
+def _find_changes_in_process(rows: Array, dt: float) -> list[TimedChangeText]:
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
         stdout=subprocess.PIPE,
-        timeout=_TIMEOUT_S,
+        timeout=_TEST_TIMEOUT_S,
         check=True,
         start_new_session=True,  # Ctrl-C stops the loop only
     )
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 
-def find_changes(rows: Array, dt: float) -> list[ReportedChange]:
+def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
@@ -127,14 +134,14 @@ def find_changes(rows: Array, dt: float) -> list[ReportedChange]:
         for cause in causes_of_fit(state)
         if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
-        and _is_decisive(state, cause.start_s)
+        and _is_change_decisive(state, cause.start_s)
     ]
 
 
-def _is_decisive(state: State, time: float) -> bool:
+def _is_change_decisive(state: State, time: float) -> bool:
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
-    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:
+    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD:
         return False
     own = next(step for step in steps if step.time == time)
     other = StepChange("offsets" if own.kind == "load" else "load", own.time)
@@ -159,8 +166,8 @@ def _change_text(cause: Cause) -> str:
 
 def main() -> None:
     if hasattr(os, "nice"):
-        os.nice(_NICENESS)
-    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_VALUES)
+        os.nice(_PROCESS_NICENESS)
+    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_READING_VALUES)
     json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
 
 

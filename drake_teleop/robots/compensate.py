@@ -15,12 +15,12 @@ import numpy as np
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, handled_sigint
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.streams import Compensated, Reading, Sink, Source
+from drake_teleop.robots.streams import CompensatedWrench, Reading, Sink, Source
 from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
@@ -63,7 +63,7 @@ def compensate_stream(
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
 
-    def write(out: Compensated) -> None:
+    def write(out: CompensatedWrench) -> None:
         sink.write(out)
         counts["wrenches"] += 1
         for name in flag_names(out.flags) if out.flags else ():
@@ -91,7 +91,7 @@ def compensate_stream(
                 write(out)
                 if changes is not None:
                     changes.add_reading(reading, out.flags)
-                if compensator.good_count >= tare_count:
+                if compensator.good_readings_in_row >= tare_count:
                     tare_count = np.inf
                     report(f"tare {compensator.tare()}")
             if control is not None:
@@ -174,7 +174,7 @@ def run_compensate_command(
             report=report,
         )
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
-        if isinstance(readings, Assembly):
+        if isinstance(readings, ReadingAssembler):
             report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:

@@ -7,26 +7,26 @@ import math
 from drake_teleop.common.compiled import njit
 from drake_teleop.load.compensation import add_weight_into, scaled_wrench_into
 
-NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
-MOVES, VARIES, TOO_FAR = 1, 2, 3
+VALUE_NOT_FINITE, VALUE_TOO_LARGE, VALUE_AT_RANGE = 1, 2, 4
+TARE_IN_MOTION, TARE_WRENCH_VARIES, TARE_EXCEEDS_DRIFT = 1, 2, 3
 """Reasons to refuse a tare: motion, contact, or more than the drift of offsets."""
-MAX_FORCE_DRIFT, MAX_TORQUE_DRIFT = 5.0, 0.25
+MAX_FORCE_OFFSET_DRIFT_N, MAX_TORQUE_OFFSET_DRIFT_NM = 5.0, 0.25
 """Maximum drift of the offsets [N], [N m]."""
-_MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
+_MAX_REST_SPECIFIC_FORCE_RMS, _MAX_REST_ANGULAR_RATE_RMS = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
 
 
 @njit(cache=True)
-def value_problem(values, largest, limits):
-    """Return 0 for a valid reading (15,), else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`."""
+def reading_problem(values, largest, limits):
+    """Return 0 for a valid reading (15,), else 1: not finite, 2: too large, or 4: at its range."""
     for i in range(15):
         if not math.isfinite(values[i]):
-            return NOT_FINITE
+            return VALUE_NOT_FINITE
     for i in range(15):
         if abs(values[i]) > largest[i]:
-            return TOO_LARGE
+            return VALUE_TOO_LARGE
     for i in range(6):
         if abs(values[i]) >= limits[i]:
-            return AT_RANGE
+            return VALUE_AT_RANGE
     return 0
 
 
@@ -45,7 +45,9 @@ def low_pass_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminate_into(values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out):
+def contact_and_scaled_wrench_into(
+    values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out
+):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
     `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
@@ -65,7 +67,7 @@ def eliminate_into(values, gravity, offsets, phi, no_load, scales, low_pass, mem
 
 
 @njit(cache=True)
-def scales_into(sigma_weight, sigma_inertia, gamma, scales):
+def set_scale_factors_into(sigma_weight, sigma_inertia, gamma, scales):
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
@@ -80,20 +82,25 @@ def add_to_statistics(row, count, mean, squares):
 
 
 @njit(cache=True)
-def tare_into(count, mean, squares, noise_limits, offsets):
+def update_tare_offsets(count, mean, squares, noise_limits, offsets):
     """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal."""
     for i in range(6, 9):
-        if squares[i] > count * (_MAX_REST_FORCE * _MAX_REST_FORCE):
-            return MOVES
+        if squares[i] > count * (_MAX_REST_SPECIFIC_FORCE_RMS * _MAX_REST_SPECIFIC_FORCE_RMS):
+            return TARE_IN_MOTION
     for i in range(9, 12):
-        if squares[i] + count * (mean[i] * mean[i]) > count * (_MAX_REST_RATE * _MAX_REST_RATE):
-            return MOVES
+        if squares[i] + count * (mean[i] * mean[i]) > count * (
+            _MAX_REST_ANGULAR_RATE_RMS * _MAX_REST_ANGULAR_RATE_RMS
+        ):
+            return TARE_IN_MOTION
     for i in range(6):
         if squares[15 + i] > count * (noise_limits[i] * noise_limits[i]):
-            return VARIES
+            return TARE_WRENCH_VARIES
     for i in range(3):
-        if abs(mean[15 + i]) > MAX_FORCE_DRIFT or abs(mean[18 + i]) > MAX_TORQUE_DRIFT:
-            return TOO_FAR
+        if (
+            abs(mean[15 + i]) > MAX_FORCE_OFFSET_DRIFT_N
+            or abs(mean[18 + i]) > MAX_TORQUE_OFFSET_DRIFT_NM
+        ):
+            return TARE_EXCEEDS_DRIFT
     for i in range(6):
         offsets[i] += mean[15 + i]
     return 0

@@ -17,65 +17,71 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi, weight_scale_error
 from drake_teleop.robots.compensation_step import (
-    AT_RANGE,
-    MAX_FORCE_DRIFT,
-    MAX_TORQUE_DRIFT,
-    MOVES,
-    NOT_FINITE,
-    TOO_FAR,
-    TOO_LARGE,
-    VARIES,
+    MAX_FORCE_OFFSET_DRIFT_N,
+    MAX_TORQUE_OFFSET_DRIFT_NM,
+    TARE_EXCEEDS_DRIFT,
+    TARE_IN_MOTION,
+    TARE_WRENCH_VARIES,
+    VALUE_AT_RANGE,
+    VALUE_NOT_FINITE,
+    VALUE_TOO_LARGE,
     add_to_statistics,
     clip_wrenches,
-    eliminate_into,
-    scales_into,
-    tare_into,
-    value_problem,
+    contact_and_scaled_wrench_into,
+    reading_problem,
+    set_scale_factors_into,
+    update_tare_offsets,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, NUM_VALUES, Compensated, Reading, ReadingFlag
+from drake_teleop.robots.streams import (
+    NONZERO_WRENCH_FLAGS,
+    NUM_READING_VALUES,
+    CompensatedWrench,
+    Reading,
+    ReadingFlag,
+)
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
 STALE_AGE_S = 0.05
 """Age of a reading above which the output wrench is zero [s]."""
 CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
-CLOCK_DRIFT = 1e-3
+MAX_CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
 RATE_TOLERANCE = 0.05
-"""Tolerated relative error of the rate, measured over `_RATE_READINGS` and `_RATE_S`."""
+"""Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
-MAX_OFFSET_DRIFT = np.repeat([MAX_FORCE_DRIFT, MAX_TORQUE_DRIFT], 3)
+MAX_SENSOR_OFFSET_DRIFT = np.repeat([MAX_FORCE_OFFSET_DRIFT_N, MAX_TORQUE_OFFSET_DRIFT_NM], 3)
 """Maximum drift of the offsets [N, N m]."""
-_RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
-_MAX_TIME_S = 1e12  # [s]
+_RATE_CHECK_READINGS, _RATE_CHECK_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
+_MAX_TIME_STAMP_S = 1e12  # [s]
 _ZERO_GRAVITY = np.zeros(3)
-_MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
+_MAX_READING_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `ReadingFlag` takes a microsecond.
 _DAMAGED, _STALE, _CLIPPED = (
     int(ReadingFlag.DAMAGED),
     int(ReadingFlag.STALE),
     int(ReadingFlag.CLIPPED),
 )
-_NONZERO_FLAGS, _GAP, _WRONG_RATE = (
-    int(NONZERO_FLAGS),
+_NONZERO_WRENCH_FLAGS, _GAP, _WRONG_RATE = (
+    int(NONZERO_WRENCH_FLAGS),
     int(ReadingFlag.GAP),
     int(ReadingFlag.WRONG_RATE),
 )
 _IN_CONTACT = int(ReadingFlag.IN_CONTACT)
-_PROBLEM_FLAGS = {
-    NOT_FINITE: ReadingFlag.NOT_FINITE,
-    TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
-    AT_RANGE: ReadingFlag.SATURATED,
+_FLAG_OF_PROBLEM = {
+    VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,
+    VALUE_TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
+    VALUE_AT_RANGE: ReadingFlag.SATURATED,
 }
 # Maximum rms of the wrench at rest, as a multiple of the residual of the identification, and at
 # least [N, N m].
-_MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
+_MAX_REST_NOISE_RATIO, _MIN_REST_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
 class _RateCheck:
     def __init__(self, dt: float) -> None:
-        self._dt, self._readings = dt, max(_RATE_READINGS, round(_RATE_S / dt))
+        self._dt, self._readings = dt, max(_RATE_CHECK_READINGS, round(_RATE_CHECK_S / dt))
         self._start_t, self._start_number = 0.0, 0
         self.reset()
 
@@ -132,26 +138,30 @@ class Compensator:
             self._low_pass = low_pass_coefficients(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
         self._largest = np.concatenate(
-            [np.minimum(_MAX_VALUES[:6], 2.0 * self._range), _MAX_VALUES[6:]]
+            [np.minimum(_MAX_READING_VALUES[:6], 2.0 * self._range), _MAX_READING_VALUES[6:]]
         )
-        self._noise_limit = np.maximum(_MAX_NOISE_RATIO * load.residual_rms, _MIN_NOISE_LIMIT)
+        self._noise_limit = np.maximum(
+            _MAX_REST_NOISE_RATIO * load.residual_rms, _MIN_REST_NOISE_LIMIT
+        )
         self._memory = np.full((2, 12), np.nan)
         self._delay_line: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
         self._rate = _RateCheck(dt)
-        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_VALUES + 6))
-        self.good_count = 0
+        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_READING_VALUES + 6))
+        self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
-        value_problem(np.zeros(NUM_VALUES), self._largest, self._range)
-        clip_wrenches(self._eliminate_load(np.zeros(NUM_VALUES), np.zeros(3)), self._range)
-        self._compute_tare()
+        reading_problem(np.zeros(NUM_READING_VALUES), self._largest, self._range)
+        clip_wrenches(
+            self._contact_and_scaled_wrench(np.zeros(NUM_READING_VALUES), np.zeros(3)), self._range
+        )
+        self._evaluate_tare()
         self._reset_filters()
-        self.good_count = 0
+        self.good_readings_in_row = 0
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def c_settings(self) -> dict[str, Any]:
         """Values of `wrench_compensator_settings` of the exported C code, by name."""
         low_pass = self._low_pass if len(self._low_pass) else np.zeros(7)
         return {
@@ -174,18 +184,18 @@ class Compensator:
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
             raise weight_scale_error("load")
-        scales_into(float(weight), float(inertia), float(gamma), self._scales)
+        set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
-    def step(self, reading: Reading, now: float) -> Compensated:
+    def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
         flags = self._reading_flags(reading, now)
-        invalid = flags & ~_NONZERO_FLAGS
+        invalid = flags & ~_NONZERO_WRENCH_FLAGS
         if invalid & ~_GAP:
             return self._zero_output(flags)
         if now - self._now > STALE_AGE_S:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
-        self._delay_line.append(self._eliminate_load(reading.values, reading.gravity))
+        self._delay_line.append(self._contact_and_scaled_wrench(reading.values, reading.gravity))
         if invalid:
             return self._zero_output(flags)
         if self._watch is not None:
@@ -196,9 +206,9 @@ class Compensator:
         wrench = self._delay_line[0].copy()
         if clip_wrenches(wrench, self._range):
             flags |= _CLIPPED
-        return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
+        return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
-    def stale_output(self, now: float) -> Compensated | None:
+    def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
         if now - self._now <= STALE_AGE_S:
             return None
@@ -209,14 +219,14 @@ class Compensator:
 
     def tare(self) -> str:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
-        if self.good_count < len(self._tare_rows):
+        if self.good_readings_in_row < len(self._tare_rows):
             return f"refused: fewer than {TARE_REST_S:g} s of good readings so far"
-        problem, step, offsets = self._compute_tare()
-        if problem == MOVES:
+        problem, step, offsets = self._evaluate_tare()
+        if problem == TARE_IN_MOTION:
             return "refused: the sensor moves"
-        if problem == VARIES:
+        if problem == TARE_WRENCH_VARIES:
             return "refused: the wrench varies, as in contact"
-        if problem == TOO_FAR:
+        if problem == TARE_EXCEEDS_DRIFT:
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
                 f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
@@ -227,29 +237,29 @@ class Compensator:
             self._watch.restart(self.offsets)
         if self._detector is not None:
             self._detector.restart()
-        self.good_count = 0
+        self.good_readings_in_row = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
-    def _compute_tare(self) -> tuple[int, Array, Array]:
-        (mean, squares), offsets = np.zeros((2, NUM_VALUES + 6)), self.offsets.copy()
+    def _evaluate_tare(self) -> tuple[int, Array, Array]:
+        (mean, squares), offsets = np.zeros((2, NUM_READING_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)
         count = float(len(self._tare_rows))
-        problem = tare_into(count, mean, squares, self._noise_limit, offsets)
-        return problem, mean[NUM_VALUES:], offsets
+        problem = update_tare_offsets(count, mean, squares, self._noise_limit, offsets)
+        return problem, mean[NUM_READING_VALUES:], offsets
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags
         if flags & _DAMAGED:
             return _DAMAGED
-        problem = value_problem(reading.values, self._largest, self._range)
+        problem = reading_problem(reading.values, self._largest, self._range)
         if not math.isfinite(reading.t):
-            problem = NOT_FINITE
-        elif abs(reading.t) > _MAX_TIME_S and problem != NOT_FINITE:
-            problem = TOO_LARGE
+            problem = VALUE_NOT_FINITE
+        elif abs(reading.t) > _MAX_TIME_STAMP_S and problem != VALUE_NOT_FINITE:
+            problem = VALUE_TOO_LARGE
         if problem:
-            flags |= int(_PROBLEM_FLAGS[problem])
-        if problem in (NOT_FINITE, TOO_LARGE):
+            flags |= int(_FLAG_OF_PROBLEM[problem])
+        if problem in (VALUE_NOT_FINITE, VALUE_TOO_LARGE):
             return flags
         ahead = now - reading.t
         started = not math.isinf(self._min_offset)
@@ -264,7 +274,7 @@ class Compensator:
             return flags | int(ReadingFlag.REORDERED)
         if started and reading.number <= self._number:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
-        drift = CLOCK_DRIFT * self._dt if started else 0.0
+        drift = MAX_CLOCK_DRIFT * self._dt if started else 0.0
         self._min_offset = min(ahead, self._min_offset + drift)
         if ahead - self._min_offset <= STALE_AGE_S:
             self._last_in_time = now
@@ -277,7 +287,7 @@ class Compensator:
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
         self._min_offset, self._number, self._t = ahead, reading.number, reading.t
         self._rate.reset()
-        self.good_count = 0
+        self.good_readings_in_row = 0
         self._now = self._last_in_time = reading.t + ahead
         self._reset_filters()
         return flags
@@ -288,22 +298,24 @@ class Compensator:
             self._detector.restart()
         self._delay_line.clear()
 
-    def _eliminate_load(self, values: Array, gravity: Array | None) -> Array:
+    def _contact_and_scaled_wrench(self, values: Array, gravity: Array | None) -> Array:
         if gravity is None:
             if self._scales[3] != 0.0:
                 remedy = "use a source with poses or joint positions, or --sigma alone"
                 raise unknown_gravity_error("gravity in the sensor frame", remedy)
             gravity = _ZERO_GRAVITY
         out = np.empty(12)
-        at = self.good_count % len(self._tare_rows)
+        at = self.good_readings_in_row % len(self._tare_rows)
         phi, zero, scales = self._phi, self._zero_phi, self._scales
         filters = self._low_pass, self._memory
-        eliminate_into(
+        contact_and_scaled_wrench_into(
             values, gravity, self.offsets, phi, zero, scales, *filters, self._tare_rows, at, out
         )
-        self.good_count += 1
+        self.good_readings_in_row += 1
         return out
 
-    def _zero_output(self, flags: int) -> Compensated:
-        self.good_count = 0
-        return Compensated(max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags))
+    def _zero_output(self, flags: int) -> CompensatedWrench:
+        self.good_readings_in_row = 0
+        return CompensatedWrench(
+            max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags)
+        )

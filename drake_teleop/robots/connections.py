@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,20 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
-    Assembly,
+    ArmKinematics,
     PartStreams,
-    PosedByJoints,
-    SensorPoseOfJoints,
+    PoseSourceFromJoints,
+    ReadingAssembler,
     pose_from_rpy,
 )
-from drake_teleop.robots.lines import LineSink, LineSource, TableSink
+from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
 from drake_teleop.robots.recording import PartRecorder, ReadingRecorder, SampleRecorder
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
-_UNUSED_RATE_HZ = 1000.0
+_PLACEHOLDER_RATE_HZ = 1000.0
 
 
 def open_source(
@@ -40,7 +41,7 @@ def open_source(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
+    arm: ArmKinematics | None = None,
 ) -> Source[Reading]:
     """Return the source at an address.
 
@@ -53,13 +54,13 @@ def open_source(
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
         arm: kinematics, for a source of joint positions.
     """
-    kind = _address_kind(address)
+    kind = _address_scheme(address)
     if kind in PART_SOURCES:
         track = load if isinstance(delay, str) else None
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
         parts = _open_parts(address, rate_hz, motion, arm)
-        return Assembly(
+        return ReadingAssembler(
             parts,
             cutoff_hz=cutoff_hz,
             delay_s=delay,
@@ -82,22 +83,22 @@ def open_source(
         raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
         raise missing_orientation_error(address)
-    return SOURCES[kind](address, _required_period(rate_hz, address))
+    return SOURCES[kind](address, _require_period_s(rate_hz, address))
 
 
-def open_recording(
+def open_source_and_recorder(
     address: str,
     largest: Array | None,
     *,
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
+    arm: ArmKinematics | None = None,
 ) -> tuple[Source[Any], SampleRecorder[Any]]:
     """Return the stream that `calibrate` reads, and its recorder."""
-    kind = _address_kind(address)
+    kind = _address_scheme(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
+    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
     if kind in PART_SOURCES:
         parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose_from_option(sensor_pose))
@@ -106,11 +107,11 @@ def open_recording(
 
 
 def is_file_address(address: str) -> bool:
-    return not _address_kind(address) and Path(address).suffix in SINKS
+    return not _address_scheme(address) and Path(address).suffix in SINKS
 
 
 def open_sink(address: str) -> Sink:
-    kind = _address_kind(address) or Path(address).suffix
+    kind = _address_scheme(address) or Path(address).suffix
     if kind not in SINKS:
         remedy = f"give {_address_forms(SINKS)}"
         raise DrakeTeleopError("is not the address of a sink", where=address, remedy=remedy)
@@ -122,13 +123,13 @@ def _address_forms(*tables: Registry[Any]) -> str:
     return ", ".join(f"{name}://" if name[0].isalnum() else name for name in names)
 
 
-def _address_kind(address: str) -> str:
+def _address_scheme(address: str) -> str:
     if address.startswith(_REPLAY_PREFIX):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""
 
 
-def _required_period(rate_hz: float | None, address: str) -> float:
+def _require_period_s(rate_hz: float | None, address: str) -> float:
     if rate_hz is None:
         raise DrakeTeleopError(
             "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
@@ -139,7 +140,7 @@ def _required_period(rate_hz: float | None, address: str) -> float:
 def _open_part_source(
     address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
 ) -> PartSource:
-    kind = _address_kind(address)
+    kind = _address_scheme(address)
     if kind not in PART_SOURCES:
         remedy = f"give {_address_forms(PART_SOURCES)}"
         raise DrakeTeleopError("delivers no motion", where=address, remedy=remedy)
@@ -147,7 +148,7 @@ def _open_part_source(
 
 
 def _open_parts(
-    address: str, rate_hz: float | None, motion: str | None, arm: SensorPoseOfJoints | None
+    address: str, rate_hz: float | None, motion: str | None, arm: ArmKinematics | None
 ) -> PartStreams:
     names = () if arm is None else arm.joint_names
     wrench = _open_part_source(address, rate_hz, names)
@@ -163,7 +164,7 @@ def _open_parts(
                 where=address if motion is None else motion,
                 remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
             )
-        posed = PosedByJoints(motion_source, arm)
+        posed = PoseSourceFromJoints(motion_source, arm)
         return PartStreams(posed) if other is None else PartStreams(wrench, posed)
     except BaseException:
         for each in (wrench, other):
@@ -176,80 +177,43 @@ def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 
-def _open_rtde(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.rtde import RtdeSource
-
-    return RtdeSource(address)
-
-
-def _open_netft(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.netft import NetFtSource
-
-    return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
-
-
-def _open_zenoh(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.ros2_zenoh import ZenohSource
-
-    return ZenohSource(address, _required_period(rate_hz, address), joints)
-
-
-def _open_ros2(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
-    from drake_teleop.robots.ros2 import Ros2Source
-
-    return Ros2Source(address, _required_period(rate_hz, address), joints)
-
-
-def _open_zenoh_sink(address: str) -> Sink:
-    from drake_teleop.robots.ros2_zenoh import ZenohSink
-
-    return ZenohSink(address)
-
-
-def _open_ros2_sink(address: str) -> Sink:
-    from drake_teleop.robots.ros2 import Ros2Sink
-
-    return Ros2Sink(address)
-
-
-def _open_foxglove(address: str) -> Sink:
-    from drake_teleop.robots.foxglove import FoxgloveSink
-
-    return FoxgloveSink(address)
-
-
-def _open_mcap(address: str) -> Sink:
-    from drake_teleop.robots.foxglove import McapSink
-
-    return McapSink(Path(address))
+def _make_stream(module: str, class_name: str, *arguments: Any) -> Any:
+    """Return an instance of a class in a module of `robots`, whose libraries are optional."""
+    return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
 
 SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
-    "source", {"udp": UdpSource, "-": lambda address, dt: LineSource(sys.stdin.fileno(), dt)}
+    "source", {"udp": UdpSource, "-": lambda address, dt: JsonLineSource(sys.stdin.fileno(), dt)}
 )
 """Sources of readings by the scheme of their address, called with address and period [s]."""
 PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource]] = Registry(
     "source of parts",
     {
-        "posed": lambda address, hz, joints: PosedSource(address, _required_period(hz, address)),
-        "rtde": _open_rtde,
-        "netft": _open_netft,
-        "zenoh": _open_zenoh,
-        "ros2": _open_ros2,
+        "posed": lambda address, hz, joints: PosedSource(address, _require_period_s(hz, address)),
+        "rtde": lambda address, hz, joints: _make_stream("rtde", "RtdeSource", address),
+        "netft": lambda address, hz, joints: _make_stream(
+            "netft", "NetFtSource", address, None if hz is None else 1.0 / hz
+        ),
+        "zenoh": lambda address, hz, joints: _make_stream(
+            "ros2_zenoh", "ZenohSource", address, _require_period_s(hz, address), joints
+        ),
+        "ros2": lambda address, hz, joints: _make_stream(
+            "ros2", "Ros2Source", address, _require_period_s(hz, address), joints
+        ),
     },
 )
 """Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
 SINKS: Registry[Callable[[str], Sink]] = Registry(
     "sink",
     {
-        "-": lambda address: LineSink(sys.stdout),
+        "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": _open_zenoh_sink,
-        "ros2": _open_ros2_sink,
-        "foxglove": _open_foxglove,
+        "zenoh": lambda address: _make_stream("ros2_zenoh", "ZenohSink", address),
+        "ros2": lambda address: _make_stream("ros2", "Ros2Sink", address),
+        "foxglove": lambda address: _make_stream("foxglove", "FoxgloveSink", address),
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": _open_mcap,
+        ".mcap": lambda address: _make_stream("foxglove", "McapSink", Path(address)),
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""

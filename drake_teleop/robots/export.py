@@ -18,7 +18,7 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
-STANDARD_GRAVITY = 9.80665  #: m/s^2
+STANDARD_GRAVITY_M_S2 = 9.80665  #: m/s^2
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Format:
     note: str = ""
 
 
-def export_text(
+def export_load(
     found: Identification,
     to: str,
     *,
@@ -79,7 +79,7 @@ def export_text(
     if format.of_sensor:
         refuse_removed_weight(found, to)
     if sensor_pose is not None and format.of_sensor:
-        raise sensor_frame_error(to)
+        raise unused_sensor_pose_error(to)
     x, y, z, *angles = [0.0] * 6 if sensor_pose is None else sensor_pose
     R_FS = rotation_matrices(np.radians([angles]), "euler", "xyz")[0]
     phi = transform_phi(found.phi, R_FS, [x, y, z])
@@ -96,7 +96,7 @@ def export_text(
     return notes + format.write(load), warnings
 
 
-def sensor_frame_error(to: str) -> DrakeTeleopError:
+def unused_sensor_pose_error(to: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         f"{to} takes its values in the sensor's frame",
         where="export",
@@ -173,7 +173,7 @@ def _kth_yaml(load: ExportedLoad) -> str:
     )
 
 
-def _ft_yaml(load: ExportedLoad) -> str:
+def _ft_tools_yaml(load: ExportedLoad) -> str:
     return to_yaml_text(
         {
             "mass": float(load.mass),
@@ -185,7 +185,7 @@ def _ft_yaml(load: ExportedLoad) -> str:
 
 
 def _admittance_yaml(load: ExportedLoad) -> str:
-    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
+    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY_M_S2)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
     return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
@@ -217,7 +217,7 @@ def _urdf_xml(load: ExportedLoad) -> str:
         "inertia",
         dict(zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)),
     )
-    return _xml_text(root)
+    return _indented_xml(root)
 
 
 def _sdf_xml(load: ExportedLoad) -> str:
@@ -229,7 +229,7 @@ def _sdf_xml(load: ExportedLoad) -> str:
     inertia = SubElement(inertial, "inertia")
     for name, value in zip(_INERTIA_NAMES, load.inertia_entries, strict=True):
         SubElement(inertia, name).text = _format_number(value)
-    return _xml_text(root)
+    return _indented_xml(root)
 
 
 def _mjcf_xml(load: ExportedLoad) -> str:
@@ -241,10 +241,10 @@ def _mjcf_xml(load: ExportedLoad) -> str:
         "fullinertia": _space_separated(load.inertia_entries),
     }
     SubElement(body, "inertial", {"pos": _space_separated(load.com)} | inertia)
-    return _xml_text(root)
+    return _indented_xml(root)
 
 
-def _xml_text(root: Element) -> str:
+def _indented_xml(root: Element) -> str:
     indent(root)
     return tostring(root, encoding="unicode") + "\n"
 
@@ -261,7 +261,7 @@ def _json_text(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
+_SENSOR_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
 
 FORMATS = Registry(
     "export format",
@@ -277,12 +277,14 @@ FORMATS = Registry(
             inertia=False,
             offsets=True,
             comment="#",
-            note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+            note=f"{_SENSOR_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
             " compensated force is twice the weight, change the sign of the mass",
         ),
-        "ft_tools": Format(_ft_yaml, of_sensor=True, inertia=False, offsets=True, comment="#"),
+        "ft_tools": Format(
+            _ft_tools_yaml, of_sensor=True, inertia=False, offsets=True, comment="#"
+        ),
         "ros2-admittance": Format(
-            _admittance_yaml, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
+            _admittance_yaml, of_sensor=True, inertia=False, comment="#", note=_SENSOR_FRAME_NOTE
         ),
         "bota": Format(
             _bota_json,

@@ -10,11 +10,11 @@ from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.files import make_folder, wrap_write_errors
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.streams import CompensatedWrench
 from drake_teleop.robots.udp import host_and_port
 
-PORT = 8765
-TOPIC = "/wrench"
+DEFAULT_SERVER_PORT = 8765
+WRENCH_TOPIC = "/wrench"
 _WRENCH_SCHEMA = {"type": "object", "properties": {c: {"type": "number"} for c in WRENCH_COLUMNS}}
 _MESSAGE_SCHEMA = {
     "title": "drake_teleop.Wrench",
@@ -35,9 +35,9 @@ class _WrenchChannel:
         import foxglove
 
         self.context = foxglove.Context()
-        self._channel = foxglove.Channel(TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
+        self._channel = foxglove.Channel(WRENCH_TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
 
-    def log_wrench(self, out: Compensated, ns: int | None) -> None:
+    def log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
@@ -51,7 +51,7 @@ class FoxgloveSink:
     """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
-        host, port = host_and_port(address, PORT)
+        host, port = host_and_port(address, DEFAULT_SERVER_PORT)
         self._channel = _WrenchChannel(address)
         import foxglove
 
@@ -63,7 +63,7 @@ class FoxgloveSink:
             raise DrakeTeleopError(str(error), where=address) from error
         self.port = self._server.port
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self._channel.log_wrench(out, None)
 
     def close(self) -> None:
@@ -84,7 +84,7 @@ class McapSink:
                 path, allow_overwrite=True, context=self._channel.context
             )
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self._channel.log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:

@@ -26,8 +26,8 @@ from drake_teleop.common.files import (
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    NUM_VALUES,
-    Compensated,
+    NUM_READING_VALUES,
+    CompensatedWrench,
     Reading,
     ReadingFlag,
     Sink,
@@ -38,7 +38,7 @@ _MAX_LINE_BYTES = 4096  # bytes per line
 _READ_BLOCK_BYTES = 65536
 
 
-def parse_reading(line: bytes, number: int) -> Reading:
+def reading_of_json_line(line: bytes, number: int) -> Reading:
     """Return the reading in a line, flagged as damaged if it is invalid."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED_READING
@@ -50,11 +50,11 @@ def parse_reading(line: bytes, number: int) -> Reading:
         flags = int(ReadingFlag.SATURATED) if data.get("saturated") else 0
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return DAMAGED_READING
-    good = values.shape == (NUM_VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
+    good = values.shape == (NUM_READING_VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
     return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED_READING
 
 
-def wrench_line(out: Compensated) -> str:
+def wrench_json_line(out: CompensatedWrench) -> str:
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
@@ -70,7 +70,7 @@ def flag_names(flags: int) -> list[str]:
     return [str(flag.name).lower().replace("_", " ") for flag in ReadingFlag if flag & flags]
 
 
-class LineSource(Source[Reading]):
+class JsonLineSource(Source[Reading]):
     """Source of readings, as lines of JSON, from a growing file such as standard input."""
 
     live = True
@@ -91,19 +91,19 @@ class LineSource(Source[Reading]):
         found = []
         for line in lines:
             if line.strip():
-                found.append(parse_reading(line, self._number))
+                found.append(reading_of_json_line(line, self._number))
                 self._number += 1
         return found
 
 
-class LineSink(Sink):
+class JsonLineSink(Sink):
     """Sink of unbuffered lines of JSON in a text file such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
 
-    def write(self, out: Compensated) -> None:
-        self._file.write(wrench_line(out) + "\n")
+    def write(self, out: CompensatedWrench) -> None:
+        self._file.write(wrench_json_line(out) + "\n")
         self._file.flush()
 
 
@@ -120,11 +120,11 @@ class TableSink:
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
         self._path, self._period = path, WRITE_PERIOD_S[path.suffix]
-        self._rows: list[Compensated] = []
+        self._rows: list[CompensatedWrench] = []
         self._written, self._end = 0, 0  # rows; bytes of the CSV file
         self._due = -np.inf
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self._rows.append(out)
         if time.monotonic() >= self._due:
             self._write_rows()
@@ -136,7 +136,7 @@ class TableSink:
     def _write_rows(self) -> None:
         import polars as pl
 
-        rows, table = len(self._rows), pl.DataFrame(self._columns())
+        rows, table = len(self._rows), pl.DataFrame(self._buffered_columns())
         if not self._written:
             remove_log(self._path)
         if self._path.suffix == ".parquet":
@@ -155,7 +155,7 @@ class TableSink:
         del self._rows[:rows]
         self._due = time.monotonic() + self._period
 
-    def _columns(self) -> dict[str, np.ndarray]:
+    def _buffered_columns(self) -> dict[str, np.ndarray]:
         rows = self._rows
         columns = {
             "t": np.array([row.t for row in rows], float),

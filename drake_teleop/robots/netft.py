@@ -10,41 +10,25 @@ import socket
 import struct
 import time
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, WRENCH, Part, ReadingFlag
 
-PORT = 49152
+DEFAULT_UDP_PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
 RECORD_FORMAT = struct.Struct(">III6i")
-START, STOP = 2, 0
+"""RDT sequence, F/T sequence, status, and the wrench in counts."""
+START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
-_SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
-_REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
-_MAX_RECORDS = 256  # records per call
+_SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
+_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
+_MAX_RECORDS_PER_CALL = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
-_SI_VALUE_OF_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
-
-
-class RdtRecord(NamedTuple):
-    """Record of the RDT protocol, with the wrench in counts."""
-
-    rdt_sequence: int
-    ft_sequence: int
-    status: int
-    counts: tuple[int, ...]
-
-
-def unpack_record(packet: bytes) -> RdtRecord | None:
-    if len(packet) != RECORD_FORMAT.size:
-        return None
-    rdt, ft, status, *counts = RECORD_FORMAT.unpack(packet)
-    return RdtRecord(rdt, ft, status, tuple(counts))
+_SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
 class NetFtSource:
@@ -53,13 +37,13 @@ class NetFtSource:
     streams: tuple[str, ...] = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
-        parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
-        counts, rate = parsed.read_numbers("counts", 2), parsed.read_numbers("rate", 1)
+        parsed = Address(address, DEFAULT_UDP_PORT, allowed=("counts", "rate", "sign"))
+        counts, rate = parsed.positive_numbers("counts", 2), parsed.positive_numbers("rate", 1)
         sign = parsed.wrench_sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _read_sensor_page(parsed)
+            page = _read_counts_and_rate(parsed)
             counts = counts or page[:2]
             rate = rate or page[2:]
         self.dt = 1.0 / rate[0]
@@ -79,7 +63,7 @@ class NetFtSource:
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
         try:
-            while len(found) < _MAX_RECORDS:
+            while len(found) < _MAX_RECORDS_PER_CALL:
                 packet = self._socket.recv(RECORD_FORMAT.size + 1)
                 found.append(self.part_of_packet(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
@@ -89,40 +73,40 @@ class NetFtSource:
 
     def part_of_packet(self, packet: bytes, now: float) -> Part:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
-        record = unpack_record(packet)
-        if record is None:
-            return DAMAGED_WRENCH
+        if len(packet) != RECORD_FORMAT.size:
+            return DAMAGED_WRENCH_PART
+        rdt_sequence, ft_sequence, status, *counts = RECORD_FORMAT.unpack(packet)
         # rdt_sequence has 32 bits and wraps around.
-        self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
+        self._number += (rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._last_received = now
         flags = 0
-        if record.status & _SATURATED:
+        if status & _SATURATED_STATUS_BIT:
             flags = int(ReadingFlag.SATURATED)
-        elif record.status & _ERROR:
+        elif status & _ERROR_STATUS_BIT:
             flags = int(ReadingFlag.DAMAGED)
-        if record.ft_sequence != self._measured:
-            self._measured, self._measured_at = record.ft_sequence, now
-        elif now - self._measured_at > _MAX_UNCHANGED_S:
+        if ft_sequence != self._measured:
+            self._measured, self._measured_at = ft_sequence, now
+        elif now - self._measured_at > _MAX_UNCHANGED_WRENCH_S:
             flags |= int(ReadingFlag.STALE)
         t = self._pace.time_of_sample(self._number, now)
-        return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
+        return Part(WRENCH, self._number, t, np.array(counts) * self._per_count, flags)
 
     def _request_stream(self) -> None:
         now = time.monotonic()
         if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
             self._last_request = now
-            self._send_command(START)
+            self._send_command(START_COMMAND)
 
     def _send_command(self, command: int) -> None:
         with suppress(OSError):  # no box yet
             self._socket.send(REQUEST_FORMAT.pack(_REQUEST_HEADER, command, 0))
 
     def close(self) -> None:
-        self._send_command(STOP)
+        self._send_command(STOP_COMMAND)
         self._socket.close()
 
 
-def _read_sensor_page(address: Address) -> list[float]:
+def _read_counts_and_rate(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
     remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
@@ -130,7 +114,7 @@ def _read_sensor_page(address: Address) -> list[float]:
     connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return parse_sensor_page(connection.getresponse().read(_MAX_PAGE_BYTES))
+        return parse_counts_and_rate(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
@@ -141,13 +125,14 @@ def _read_sensor_page(address: Address) -> list[float]:
         connection.close()
 
 
-def parse_sensor_page(content: bytes) -> list[float]:
+def parse_counts_and_rate(content: bytes) -> list[float]:
     """Return counts per N and per N m, and the rate [Hz], of the page netftapi2.xml."""
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
     counts = [
-        float(text[f"cfgcp{kind}"]) / _SI_VALUE_OF_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
+        float(text[f"cfgcp{kind}"])
+        / _SI_VALUE_OF_SENSOR_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
         for kind in ("f", "t")
     ]
     values = [*counts, float(text["comrdtrate"])]
@@ -156,7 +141,7 @@ def parse_sensor_page(content: bytes) -> list[float]:
     return values
 
 
-_MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
+_MIN_CLOCK_SPAN_S, _MAX_CLOCK_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
 _RESTART_STEP_S = 1.0  # a larger step of the number is a restart
 
 
@@ -176,9 +161,9 @@ class SampleClock:
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _RESTART_STEP_S:
             self._first = number, now
-        elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
+        elif now - self._first[1] >= _MIN_CLOCK_SPAN_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])
-            if now - self._first[1] > _MAX_SPAN_S:
+            if now - self._first[1] > _MAX_CLOCK_SPAN_S:
                 self._first = number, now
         t = self._t + step * self._period
         if step > 0 or self._first == (number, now):

@@ -18,7 +18,15 @@ from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import PartStreams
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
-from drake_teleop.robots.streams import IMU, NUM_VALUES, POSE, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.streams import (
+    IMU,
+    NUM_READING_VALUES,
+    POSE,
+    WRENCH,
+    Part,
+    Reading,
+    ReadingFlag,
+)
 
 _INVALID_FLAGS = (
     ReadingFlag.DAMAGED
@@ -27,7 +35,7 @@ _INVALID_FLAGS = (
     | ReadingFlag.SATURATED
     | ReadingFlag.GAP
 )
-_LOG_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
+_LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
     WRENCH: {"force": canonical.WRENCH_COLUMNS[:3], "torque": canonical.WRENCH_COLUMNS[3:]},
     POSE: {"orientation": canonical.QUATERNION_COLUMNS, "position": canonical.POSITION_COLUMNS},
     IMU: {
@@ -36,12 +44,12 @@ _LOG_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
-_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
+_QUATERNION_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
 _NEW_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
-_T = TypeVar("_T")
+_SampleT = TypeVar("_SampleT")
 
 
-class SampleRecorder(ABC, Generic[_T]):
+class SampleRecorder(ABC, Generic[_SampleT]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
     If the source's clock is set, a new record starts; the longest one is written.
@@ -51,16 +59,16 @@ class SampleRecorder(ABC, Generic[_T]):
         clock_changes: number of clock changes.
     """
 
-    file: str
-    files: tuple[str, ...]
+    log_file_name: str
+    file_names: tuple[str, ...]
 
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
         self.left_out, self.clock_changes = 0, 0
-        self._part, self._other_clock = self._empty_part(), self._empty_part()
+        self._part, self._other_clock = self._make_empty_part(), self._make_empty_part()
         self._longest = self._part
 
-    def _empty_part(self) -> dict[str, _SampleSeries]:
+    def _make_empty_part(self) -> dict[str, _SampleSeries]:
         return {stream: _SampleSeries() for stream in self._largest}
 
     def _add_sample(
@@ -80,7 +88,7 @@ class SampleRecorder(ABC, Generic[_T]):
         if len(other.t) == _NEW_CLOCK_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
-            self._part, self._other_clock = self._other_clock, self._empty_part()
+            self._part, self._other_clock = self._other_clock, self._make_empty_part()
 
     def _longest_part(self) -> dict[str, _SampleSeries]:
         return max(self._part, self._longest, key=_duration_s)
@@ -90,7 +98,7 @@ class SampleRecorder(ABC, Generic[_T]):
         return _duration_s(self._longest_part())
 
     @abstractmethod
-    def add(self, sample: _T) -> None:
+    def add(self, sample: _SampleT) -> None:
         """Add a sample if it is valid."""
 
     @abstractmethod
@@ -100,8 +108,8 @@ class SampleRecorder(ABC, Generic[_T]):
 class ReadingRecorder(SampleRecorder[Reading]):
     """Recorder of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
-    file = "log.parquet"
-    files: tuple[str, ...] = (file,)
+    log_file_name = "log.parquet"
+    file_names: tuple[str, ...] = (log_file_name,)
 
     def __init__(self, largest: Array | None = None) -> None:
         super().__init__({WRENCH: largest})
@@ -110,7 +118,7 @@ class ReadingRecorder(SampleRecorder[Reading]):
         self._add_sample(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        t, values = self._longest_part()[WRENCH].times_and_values(NUM_VALUES, self.left_out)
+        t, values = self._longest_part()[WRENCH].times_and_values(NUM_READING_VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
@@ -121,8 +129,11 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
     `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame F.
     """
 
-    file = "log.yaml"
-    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _LOG_FIELDS))
+    log_file_name = "log.yaml"
+    file_names: tuple[str, ...] = (
+        log_file_name,
+        *(f"{stream}.parquet" for stream in _LOG_COLUMNS_OF_STREAM),
+    )
 
     def __init__(self, parts: PartStreams, largest: Array | None, X_FS: Array) -> None:
         super().__init__({WRENCH: largest, parts.motion_stream: None})
@@ -136,7 +147,9 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
             return
         size = float(np.linalg.norm(part.values[:4])) if part.stream == POSE else 1.0
         flags = (
-            part.flags if abs(size - 1.0) < _NORM_TOLERANCE else part.flags | ReadingFlag.DAMAGED
+            part.flags
+            if abs(size - 1.0) < _QUATERNION_NORM_TOLERANCE
+            else part.flags | ReadingFlag.DAMAGED
         )
         self._add_sample(part.stream, part.t, part.values, flags, now)
 
@@ -150,7 +163,9 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
             (WRENCH, wrench, -start),
             (self._motion_stream, motion, behind - start),
         ):
-            names = [name for columns in _LOG_FIELDS[stream].values() for name in columns]
+            names = [
+                name for columns in _LOG_COLUMNS_OF_STREAM[stream].values() for name in columns
+            ]
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
@@ -159,7 +174,10 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
     def _log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY_M_S2}
         for stream in (WRENCH, self._motion_stream):
-            fields = {name: {"columns": list(names)} for name, names in _LOG_FIELDS[stream].items()}
+            fields = {
+                name: {"columns": list(names)}
+                for name, names in _LOG_COLUMNS_OF_STREAM[stream].items()
+            }
             found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
         if self._motion_stream == POSE:
             R_SF = self._R_FS.T

@@ -15,7 +15,7 @@ from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import (
-    MESSAGE_TYPES,
+    MESSAGE_TYPE_OF_TOPIC,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
@@ -24,11 +24,11 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of_address,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Part, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, CompensatedWrench, Part, ReadingFlag
 
 _NODE_NAME = "drake_teleop"
 _DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
-_MAX_MESSAGES = 256  # queued messages of a stream
+_MAX_QUEUED_MESSAGES = 256  # queued messages of a stream
 _SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
 
 
@@ -97,7 +97,7 @@ class Ros2Source:
         parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
-        classes = {name: message_class(MESSAGE_TYPES[name], address) for name in topics}
+        classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
         self._found: list[Part] = []
         self._counts: Counter[str] = Counter()
@@ -125,7 +125,7 @@ class Ros2Source:
         # An executor needs 0.3 ms to find each message; taking those that are there needs 0.02 ms.
         for subscription, receive in self._subscriptions:
             with subscription.handle:
-                for _ in range(_MAX_MESSAGES):
+                for _ in range(_MAX_QUEUED_MESSAGES):
                     taken = subscription.handle.take_message(subscription.msg_type, True)
                     if taken is None:
                         break
@@ -153,7 +153,9 @@ class Ros2Source:
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        best_effort = QoSProfile(depth=_MAX_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
+        best_effort = QoSProfile(
+            depth=_MAX_QUEUED_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT
+        )
         options = {"callback": receive, "qos_profile": best_effort, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 
@@ -167,7 +169,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data
 
         topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.read_word("wrench", ("contact", "scaled"))
+        self._which = parsed.chosen_word("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
         kinds += ["diagnostic_msgs/msg/KeyValue"]
@@ -185,7 +187,7 @@ class Ros2Sink:
         self._diagnostics = node.create_publisher(self._kinds.DiagnosticArray, "/diagnostics", 100)
 
     @delayed_signals()
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         message, ns = self._message, time.time_ns()
         _set_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
@@ -204,10 +206,10 @@ class Ros2Sink:
     def close(self) -> None:
         self._node.close()
 
-    def _diagnostics_message(self, out: Compensated, ns: int) -> Any:
+    def _diagnostics_message(self, out: CompensatedWrench, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
-        if out.flags & ~NONZERO_FLAGS:
+        if out.flags & ~NONZERO_WRENCH_FLAGS:
             level = kind.STALE if out.flags == ReadingFlag.STALE else kind.ERROR
         pairs = {"number": out.number, "t": repr(float(out.t)), "flags": out.flags, **self._counts}
         values = [self._kinds.KeyValue(key=key, value=str(value)) for key, value in pairs.items()]

@@ -10,10 +10,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_product, rotate_vector
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, IMU, JOINTS, POSE, WRENCH, Part
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
-MESSAGE_TYPES = {
+MESSAGE_TYPE_OF_TOPIC = {
     WRENCH: WRENCH_STAMPED,
     "tf": "tf2_msgs/msg/TFMessage",
     POSE: "geometry_msgs/msg/PoseStamped",
@@ -75,7 +75,7 @@ def source_topics(
 
 
 def damaged_part(name: str) -> Part:
-    return DAMAGED_WRENCH._replace(stream=_STREAM_OF_TOPIC.get(name, name))
+    return DAMAGED_WRENCH_PART._replace(stream=_STREAM_OF_TOPIC.get(name, name))
 
 
 class MessageConverter:
@@ -88,7 +88,7 @@ class MessageConverter:
         self._links: dict[str, tuple[str, Array]] = {}
 
     def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
-        """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPES`."""
+        """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
             samples = self._transform_pose(data)
         else:

@@ -21,8 +21,8 @@ from drake_teleop.robots.ros2 import parse_ros2_address, shared_node
 from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of_address
 
 _SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
-_CALIBRATION_END_S = 3.0  # longest time for the last evaluation of a calibration [s]
-_CALIBRATE_CODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
+_CALIBRATION_STOP_TIMEOUT_S = 3.0  # longest time for the last evaluation of a calibration [s]
+_CALIBRATE_PYTHON_CODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
 class ServedCompensator:
@@ -70,7 +70,7 @@ class ServedCompensator:
         if (process := self._process) is not None:
             process.terminate()
             try:
-                process.wait(_CALIBRATION_END_S)
+                process.wait(_CALIBRATION_STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
         self._pool.shutdown()
@@ -119,7 +119,7 @@ class ServedCompensator:
         if self._process is not None:
             response.message = "refused: a calibration runs already"
             return response
-        words = [sys.executable, "-c", _CALIBRATE_CODE]
+        words = [sys.executable, "-c", _CALIBRATE_PYTHON_CODE]
         words += self._calibrate(self._parameter_value("until"), self._parameter_value("seconds"))
         process = self._process = subprocess.Popen(
             words,

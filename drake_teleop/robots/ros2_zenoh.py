@@ -15,7 +15,7 @@ from drake_teleop.common.errors import require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2_messages import (
-    MESSAGE_TYPES,
+    MESSAGE_TYPE_OF_TOPIC,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
@@ -24,12 +24,12 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of_address,
 )
-from drake_teleop.robots.streams import Compensated, Part
+from drake_teleop.robots.streams import CompensatedWrench, Part
 
-PORT = 7447
-_NUMBER_FORMAT = struct.Struct("<qq")
+DEFAULT_ROUTER_PORT = 7447
+_NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
 _ATTACHMENT_FORMAT = struct.Struct("<qqB16s")
-_OLD_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
+_OLD_ATTACHMENT_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
 _MAX_QUEUED_MESSAGES = 4096  # queued messages; newer ones are dropped
 _NODE_NAME = "drake_teleop"
 
@@ -87,9 +87,12 @@ def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
 
 def message_number(attached: bytes) -> int | None:
     if len(attached) == _ATTACHMENT_FORMAT.size:
-        return int(_NUMBER_FORMAT.unpack_from(attached)[0])
-    if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
-        return int(struct.unpack_from("<q", attached, len(_OLD_PREFIX))[0])
+        return int(_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
+    if (
+        attached.startswith(_OLD_ATTACHMENT_PREFIX)
+        and len(attached) >= len(_OLD_ATTACHMENT_PREFIX) + 8
+    ):
+        return int(struct.unpack_from("<q", attached, len(_OLD_ATTACHMENT_PREFIX))[0])
     return None
 
 
@@ -108,10 +111,10 @@ class CdrConverter(MessageConverter):
 
         super().__init__(sign, frames, joints)
         self._types, self._damaged = message_types(), SerdeError
-        self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
-        for name in MESSAGE_TYPES:  # creates the deserializers before the first message
+        self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
+        for name in MESSAGE_TYPE_OF_TOPIC:  # creates the deserializers before the first message
             self.parts_of_cdr(name, b"", b"")
-        self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
+        self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
 
     def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
         self._counts[name] += 1
@@ -119,7 +122,7 @@ class CdrConverter(MessageConverter):
         if number is None:
             number = self._counts[name]
         try:
-            data = self._types.deserialize_cdr(message, MESSAGE_TYPES[name])
+            data = self._types.deserialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])
         except self._damaged:
             return [damaged_part(name)]
         return self.parts_of_message(name, data, number)
@@ -132,7 +135,7 @@ class ZenohSource:
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = Address(address, PORT, allowed=SOURCE_PARAMETERS)
+        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
         require_libraries(address)
@@ -141,7 +144,7 @@ class ZenohSource:
         self._session = open_session(parsed)
         for stream, topic in topics.items():
             self._session.declare_subscriber(
-                topic_key(domain, topic, MESSAGE_TYPES[stream]), self._make_callback(stream)
+                topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream]), self._make_callback(stream)
             )
 
     def read(self, timeout_s: float) -> list[Part] | None:
@@ -174,9 +177,9 @@ class ZenohSink:
     """
 
     def __init__(self, address: str) -> None:
-        parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
+        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
-        which = parsed.read_word("wrench", ("contact", "scaled"))
+        which = parsed.chosen_word("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which
         self._frame = parsed.optional_parameter("frame") or ""
@@ -192,7 +195,7 @@ class ZenohSink:
             topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True
         )
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         ns = time.time_ns()
         self._number += 1
         message = self.wrench_message(getattr(out, self._which), ns)

@@ -17,10 +17,10 @@ from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
-PORT = 30004
+RTDE_PORT = 30004
 _START_TIMEOUT_S = 10.0  # wait for the robot at the start
-_RESTART_PERIOD_S = 0.2  # between two starts of the child
-_RATE_SAMPLES = 5  # samples for the rate
+_MIN_RESTART_PERIOD_S = 0.2  # between two starts of the child
+_RATE_MEASUREMENT_SAMPLES = 5  # samples for the rate
 _READ_BLOCK_BYTES = 65536
 
 
@@ -30,8 +30,8 @@ class RtdeSource:
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 
     def __init__(self, address: str) -> None:
-        parsed = Address(address, PORT, allowed=("sign",))
-        if parsed.port != PORT:
+        parsed = Address(address, RTDE_PORT, allowed=("sign",))
+        if parsed.port != RTDE_PORT:
             raise DrakeTeleopError(
                 "RTDE always uses port 30004", where=address, remedy="remove the port"
             )
@@ -42,9 +42,12 @@ class RtdeSource:
         quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
         deadline = time.monotonic() + _START_TIMEOUT_S
-        while len(self._first) < _RATE_SAMPLES and (left := deadline - time.monotonic()) > 0.0:
+        while (
+            len(self._first) < _RATE_MEASUREMENT_SAMPLES
+            and (left := deadline - time.monotonic()) > 0.0
+        ):
             self._first += self._read_samples(left)
-        if len(self._first) < _RATE_SAMPLES:
+        if len(self._first) < _RATE_MEASUREMENT_SAMPLES:
             self.close()
             raise DrakeTeleopError(
                 "no robot answers on port 30004",
@@ -63,11 +66,11 @@ class RtdeSource:
             return []
         block = os.read(self._pipe, _READ_BLOCK_BYTES)
         if not block:
-            if time.monotonic() - self._started > _RESTART_PERIOD_S:
+            if time.monotonic() - self._started > _MIN_RESTART_PERIOD_S:
                 self._stop_process()
                 self._start_process()
             else:
-                time.sleep(min(timeout_s, _RESTART_PERIOD_S))
+                time.sleep(min(timeout_s, _MIN_RESTART_PERIOD_S))
             return []
         block = self._partial + block
         complete = len(block) - len(block) % SAMPLE_FORMAT.size

@@ -12,8 +12,8 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-_T = TypeVar("_T")
-NUM_VALUES = 15
+_SampleT = TypeVar("_SampleT")
+NUM_READING_VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
 
@@ -35,7 +35,7 @@ class ReadingFlag(IntFlag):
     OTHER_LOAD = 4096  #: explained by another load; the wrench is not zero
 
 
-NONZERO_FLAGS = (
+NONZERO_WRENCH_FLAGS = (
     ReadingFlag.WRONG_RATE | ReadingFlag.CLIPPED | ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD
 )
 """Flags with a nonzero wrench."""
@@ -73,7 +73,7 @@ WRENCH, POSE, IMU, JOINTS = "wrench", "pose", "imu", "joints"
 ACCELERATION = "acceleration"
 
 
-class Compensated(NamedTuple):
+class CompensatedWrench(NamedTuple):
     """Sample for a sink: contact wrench (6,) and scaled wrench (6,) [N, N m]."""
 
     number: int
@@ -83,13 +83,13 @@ class Compensated(NamedTuple):
     flags: int
 
 
-DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_VALUES, np.nan), int(ReadingFlag.DAMAGED))
+DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_READING_VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
-DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
+DAMAGED_WRENCH_PART = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
 """Part for invalid packets."""
 
 
-class Source(Protocol[_T]):
+class Source(Protocol[_SampleT]):
     """Interface of a source of readings, or of other samples.
 
     Attributes:
@@ -100,7 +100,7 @@ class Source(Protocol[_T]):
     dt: float
     live: bool
 
-    def read(self, timeout_s: float) -> list[_T] | None:
+    def read(self, timeout_s: float) -> list[_SampleT] | None:
         """Return the samples after waiting for the first; [] after the timeout, None at the end."""
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ class PartSource(Protocol):
 class Sink(Protocol):
     """Interface of a sink of compensated wrenches."""
 
-    def write(self, out: Compensated) -> None: ...
+    def write(self, out: CompensatedWrench) -> None: ...
 
     def close(self) -> None:
         return

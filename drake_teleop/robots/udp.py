@@ -15,8 +15,8 @@ from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    DAMAGED_WRENCH,
-    Compensated,
+    DAMAGED_WRENCH_PART,
+    CompensatedWrench,
     Part,
     Reading,
     ReadingFlag,
@@ -28,8 +28,8 @@ POSED_FORMAT = struct.Struct("<4sIQd13d")
 WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEADER_FORMAT = struct.Struct("<4sIQd")
-_MAX_PACKETS = 256  # packets per call
-_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
+_MAX_PACKETS_PER_CALL = 256  # packets per call
+_SOCKET_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
 _SATURATED_FLAG = int(ReadingFlag.SATURATED)
 
 
@@ -54,19 +54,19 @@ def pack_parts(wrench: Part, pose: Part) -> bytes:
 
 def unpack_parts(packet: bytes) -> list[Part]:
     if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
-        return [DAMAGED_WRENCH]
+        return [DAMAGED_WRENCH_PART]
     _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
     wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED_FLAG)
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
-def pack_wrench(out: Compensated) -> bytes:
+def pack_wrench(out: CompensatedWrench) -> bytes:
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
     return _HEADER_FORMAT.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
-def unpack_wrench(packet: bytes) -> Compensated:
+def unpack_wrench(packet: bytes) -> CompensatedWrench:
     if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError(
             f"its {len(packet)} bytes are not a compensated wrench",
@@ -74,7 +74,7 @@ def unpack_wrench(packet: bytes) -> Compensated:
             remedy=f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}",
         )
     _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)
-    return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
+    return CompensatedWrench(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
 def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
@@ -107,7 +107,7 @@ class _PacketReceiver:
         self.dt = dt
         self._socket = open_udp_receiver(*host_and_port(address))
         self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
@@ -116,7 +116,7 @@ class _PacketReceiver:
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
-                while len(found) < _MAX_PACKETS:
+                while len(found) < _MAX_PACKETS_PER_CALL:
                     found.append(self._socket.recv(READING_FORMAT.size + 1))
         return found
 
@@ -157,7 +157,7 @@ class UdpSink:
         self._to = host_and_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         """Send a wrench; drop it if it cannot be sent now."""
         try:
             self._socket.sendto(pack_wrench(out), self._to)

@@ -27,25 +27,29 @@ from drake_teleop.load.online.watched import (
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import low_pass_coefficients
+from drake_teleop.logs.causal import causal_low_pass, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
 
-MODEL_ERROR_FRACTION = 0.02
+LOAD_WRENCH_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
-MIN_NOISE_1_KHZ = np.repeat([0.05, 0.0025], 3)
+MIN_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_NEVER_REPLACED_BOUND = 1e-12  # accuracy at which another load would replace the present one
+_UNREACHABLE_LOAD_ACCURACY = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
-_NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
+_NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
     """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
-    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
-    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE_1_KHZ * math.sqrt(1e-3 / dt))
+    share = (
+        1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH_OVER_CUTOFF * cutoff_hz * dt)
+    )
+    return np.maximum(
+        load.residual_rms / math.sqrt(share), MIN_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt)
+    )
 
 
 class ContactAndLoadMonitor:
@@ -55,7 +59,11 @@ class ContactAndLoadMonitor:
         noise = unfiltered_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_detector_parameters(
-            noise, np.zeros(9), dt, model_error=MODEL_ERROR_FRACTION, bound=_NEVER_REPLACED_BOUND
+            noise,
+            np.zeros(9),
+            dt,
+            model_error=LOAD_WRENCH_ERROR_FRACTION,
+            bound=_UNREACHABLE_LOAD_ACCURACY,
         )
         self._phi = usable_phi(load)[0]
         self._covariance = limit_covariance(self._phi, load.covariance)
@@ -78,10 +86,10 @@ class ContactAndLoadMonitor:
         return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0
 
 
-CONTACT_MEAN_S = 3.0
+MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
-_STATISTIC = "level"
+_CONTACT_STATISTIC = "level"
 _RATE_TOLERANCE = 0.05
 
 
@@ -113,7 +121,9 @@ class StreamContactDetector:
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
-        rows = self._low_pass_rows(np.hstack([contact, values[:, 6:]]))
+        fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
+        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
+        rows = np.hstack([fast, fast[:, 6:9] - slow_s])
         # Skip the transient of the low-passes.
         settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
@@ -121,9 +131,13 @@ class StreamContactDetector:
         covariance = limit_covariance(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
+        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_CONTACT_STATISTIC))
         self._settings = ContactDetector(
-            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / CONTACT_MEAN_S
+            floor,
+            threshold,
+            statistic=_CONTACT_STATISTIC,
+            hold=hold,
+            following=dt / MEAN_WRENCH_TIME_CONSTANT_S,
         ).settings
         self.restart()
         self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
@@ -133,36 +147,21 @@ class StreamContactDetector:
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
-    def _low_pass_rows(self, rows: Array) -> Array:
-        filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
-        out = np.empty((len(rows), 18))
-        for row, to in zip(rows, out, strict=True):
-            to[:6] = row[:6]
-            low_pass_into(to[:6], self._fast, contacts)
-            _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
-        return out
-
     def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
-        touched = _detect_contact(
+        touched = _filter_and_detect_contact(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(ReadingFlag.IN_CONTACT) if touched else 0
 
 
 @njit(cache=True)
-def _filter_motion_into(values, fast, slow, filters, out):
-    out[:9] = values[6:]
-    low_pass_into(out[:9], fast, filters[:, :9])
-    out[9:] = values[6:9]
-    low_pass_into(out[9:], slow, filters[:, 9:])
-    for i in range(3):
-        out[9 + i] = out[i] - out[9 + i]
-
-
-@njit(cache=True)
-def _detect_contact(memory, values, contact, fast, slow, filters, settings):
+def _filter_and_detect_contact(memory, values, contact, fast, slow, filters, settings):
     filtered = np.empty(12)
-    _filter_motion_into(values, fast, slow, filters, filtered)
+    filtered[:9], filtered[9:] = values[6:], values[6:9]
+    low_pass_into(filtered[:9], fast, filters[:, :9])
+    low_pass_into(filtered[9:], slow, filters[:, 9:])
+    for i in range(3):
+        filtered[9 + i] = filtered[i] - filtered[9 + i]
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
     return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)

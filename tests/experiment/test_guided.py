@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.guided import (
     parse_experiment_message,
 )
 from drake_teleop.live.experiment.procedure import Procedure
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.session import read_drive
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -45,7 +45,7 @@ class Person:
         load = IdentifiedLoad(truth, None, from_cache=False)
         task, condition = EXPERIMENT.tasks[0], EXPERIMENT.conditions[0]
         self.now, self.folder, self.frames = 0.0, folder, []
-        self.store = Store(folder)
+        self.store = TrialStore(folder)
         self.procedure = Procedure(EXPERIMENT, 1, self.store)
         self.guided = GuidedExperiment(
             self.procedure,

@@ -20,8 +20,8 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
-from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
-from drake_teleop.live.experiment.store import Store, open_trial_store
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
+from drake_teleop.live.experiment.store import TrialStore, open_trial_store
 
 SMALL = Experiment(
     tasks=[ContactDetection(trials=6, practice=2), ApparentMass(trials=5), PegInSlot(trials=2)],
@@ -48,7 +48,7 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
             procedure.start_second_interval()
         elif procedure.phase == "answer":
             p = correct_probability(procedure.level, threshold, 1.5, 0.0)
-            signal = procedure.trial.signal
+            signal = procedure.trial.signal_interval
             procedure.store_answer(signal if rng.random() < p else 3 - signal, 0.5)
         else:
             procedure.advance_phase()
@@ -61,14 +61,14 @@ def test_order_is_random_and_each_round_has_every_condition_once():
     assert all(sorted(counted[k : k + 3]) == [0, 1, 2] for k in range(0, 18, 3))
     orders = {tuple(dict.fromkeys(t.task for t in plan_trials(SMALL, n))) for n in range(30)}
     assert len(orders) == 6
-    signals = [t.signal for n in range(30) for t in plan_trials(SMALL, n) if t.task == 0]
-    assert {t.signal for t in one if t.task == 2} == {0}
+    signals = [t.signal_interval for n in range(30) for t in plan_trials(SMALL, n) if t.task == 0]
+    assert {t.signal_interval for t in one if t.task == 2} == {0}
     assert 0.4 < np.mean(np.array(signals) == 1) < 0.6
 
 
 def test_participant_continues_with_the_same_levels(tmp_path):
     """A new process has only the folder; an unfinished trial is lost."""
-    whole, cut = Store(tmp_path / "whole"), Store(tmp_path / "cut")
+    whole, cut = TrialStore(tmp_path / "whole"), TrialStore(tmp_path / "cut")
     go_through(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
     rng = np.random.default_rng(1)
     first = Procedure(SMALL, 3, cut)
@@ -89,7 +89,7 @@ def goes_through(folder: str) -> None:
         while procedure.phase != "end":
             if procedure.phase == "answer":
                 right = procedure.trial_number % 4 != 2
-                signal = procedure.trial.signal
+                signal = procedure.trial.signal_interval
                 procedure.store_answer(signal if right else 3 - signal, 0.5)
                 print(procedure.trial_number, flush=True)
             elif procedure.phase == "interval":
@@ -112,24 +112,28 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     message = next(int(line) for line in process.stdout if int(line) >= 4)
     process.kill()
     process.communicate()
-    cut = Store(tmp_path / "cut")
+    cut = TrialStore(tmp_path / "cut")
     left = len(cut.read_rows(1))
     assert message <= left < len(plan_trials(SHORT, 1))
     goes_through(str(tmp_path / "cut"))
     goes_through(str(tmp_path / "whole"))
-    assert cut.read_rows(1) == Store(tmp_path / "whole").read_rows(1)
+    assert cut.read_rows(1) == TrialStore(tmp_path / "whole").read_rows(1)
 
 
 def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_path):
-    procedure = Procedure(SMALL, 1, Store(tmp_path))
+    procedure = Procedure(SMALL, 1, TrialStore(tmp_path))
     before = procedure.trial_number
     procedure.advance_phase(), procedure.advance_phase(), procedure.advance_phase()
     assert procedure.phase == "interval"
     procedure.store_answer(1, 0.1)  # not in the phase of an answer
     procedure.finish_interval(IntervalResult(valid=False))
-    assert (procedure.phase, procedure.again, procedure.trial_number) == ("ready", True, before)
+    assert (procedure.phase, procedure.is_repeated, procedure.trial_number) == (
+        "ready",
+        True,
+        before,
+    )
     go_through(procedure, np.random.default_rng(0), 2.0)
-    counted = [row for row in Store(tmp_path).read_rows(1) if not row.practice]
+    counted = [row for row in TrialStore(tmp_path).read_rows(1) if not row.practice]
     assert len(counted) == 3 * (6 + 5 + 2)
 
 
@@ -137,7 +141,7 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
     def views(names: list[int]) -> list[dict]:
         conditions = [SMALL.conditions[k] for k in names]
         other = dataclasses.replace(SMALL, conditions=conditions)
-        procedure = Procedure(other, 1, Store(tmp_path / str(names)))
+        procedure = Procedure(other, 1, TrialStore(tmp_path / str(names)))
         seen = []
         while procedure.phase != "end" and procedure.trial_number < 12:
             seen.append(procedure.page_state())
@@ -146,7 +150,7 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
             elif procedure.phase == "gap":
                 procedure.start_second_interval()
             elif procedure.phase == "answer":
-                procedure.store_answer(procedure.trial.signal, 0.5)
+                procedure.store_answer(procedure.trial.signal_interval, 0.5)
             else:
                 procedure.advance_phase()
         return seen
@@ -160,7 +164,7 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
         with pytest.raises(DrakeTeleopError, match="another process"):
             open_trial_store(tmp_path, SMALL).__enter__()
         go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
-        assert store.results_table().shape == (3, 12)
+        assert store.trials_table().shape == (3, 12)
         text = store.participant_file(1).read_text()
         for damaged in (text[:-30], text.replace("\n1,", "\n7,"), "trial\nx"):
             store.participant_file(1).write_text(damaged)
@@ -204,9 +208,9 @@ def test_the_shipped_experiment_is_complete():
 def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, high):
     task = ContactDetection(trials=2, practice=3, low=low, high=high)
     experiment = Experiment(tasks=[task], conditions=[Condition(name="a")])
-    store = Store(tmp_path)
+    store = TrialStore(tmp_path)
     go_through(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
-    rows, psi = store.read_rows(1), Psi(low, high)
+    rows, psi = store.read_rows(1), PsiMethod(low, high)
     assert not all(row.correct for row in rows[:3])
     assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]
     psi.update(rows[3].level, bool(rows[3].correct))

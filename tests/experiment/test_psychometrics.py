@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
 
 
 def test_the_threshold_is_where_d_prime_is_1():
@@ -15,7 +15,7 @@ def test_the_threshold_is_where_d_prime_is_1():
 
 
 def test_next_level_minimises_the_expected_entropy():
-    psi = Psi(0.2, 20.0)
+    psi = PsiMethod(0.2, 20.0)
     for level, correct in ((2.0, True), (1.0, False), (0.9, True)):
         psi.update(level, correct)
 
@@ -25,7 +25,7 @@ def test_next_level_minimises_the_expected_entropy():
         p = float((psi._correct_probability(level) * posterior).sum())
         after = []
         for correct in (True, False):
-            other = Psi(0.2, 20.0)
+            other = PsiMethod(0.2, 20.0)
             other._posterior = posterior.copy()
             other.update(level, correct)
             share = other._posterior.sum(axis=(1, 2))
@@ -41,7 +41,7 @@ def test_intervals_contain_the_true_thresholds():
     held, off = [], []
     for _ in range(30):
         truth = float(np.exp(rng.uniform(np.log(0.4), np.log(10.0))))
-        psi = Psi(0.2, 20.0)
+        psi = PsiMethod(0.2, 20.0)
         for _ in range(40):
             level = psi.next_level()
             psi.update(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
@@ -55,7 +55,7 @@ def test_intervals_contain_the_true_thresholds():
 @pytest.mark.parametrize(("low", "high"), [(0.2, 20.0), (0.004, 0.15)])
 @pytest.mark.parametrize(("node", "slope", "lapse"), [(3, 0, 0), (40, 2, 3), (77, 6, 1)])
 def test_a_single_node_of_the_grid_is_the_median(low, high, node, slope, lapse):
-    psi = Psi(low, high)
+    psi = PsiMethod(low, high)
     psi._posterior[:] = 0.0
     psi._posterior[node, slope, lapse] = 1.0
     spacing = (4.0 * high / low) ** (1 / 80)  # of 81 thresholds from low / 2 to 2 high

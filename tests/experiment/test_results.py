@@ -14,19 +14,19 @@ from drake_teleop.common.style import Picture
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, plan_trials
 from drake_teleop.live.experiment.results import (
-    Result,
+    ResultRow,
     _draw_results,
     compute_results,
     write_results,
 )
-from drake_teleop.live.experiment.store import Store, TrialRow
+from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
 CONTACT = "threshold of contact [N at the tool]"
 
 
 def test_table_contains_the_true_thresholds(tmp_path):
     experiment = Experiment(tasks=[ContactDetection(trials=40)], conditions=[Condition(name="a")])
-    store, rng = Store(tmp_path), np.random.default_rng(2)
+    store, rng = TrialStore(tmp_path), np.random.default_rng(2)
     for number in range(1, 6):
         go_through(Procedure(experiment, number, store), rng, 2.0)
     found = [r for r in compute_results(experiment, store) if r.quantity == CONTACT]
@@ -39,7 +39,7 @@ def test_table_contains_the_true_thresholds(tmp_path):
 
 @pytest.mark.pictures
 def test_folder_contains_table_trials_and_picture(tmp_path):
-    store = Store(tmp_path)
+    store = TrialStore(tmp_path)
     assert write_results(SMALL, store).is_empty()
     go_through(Procedure(SMALL, 4, store), np.random.default_rng(0), 2.0)
     table = write_results(SMALL, store)
@@ -55,7 +55,7 @@ def test_folder_contains_table_trials_and_picture(tmp_path):
 def test_axis_of_a_quantity_has_tick_labels(least, most):
     axes = Picture(figsize=(2.9, 2.0)).subplots()
     _draw_results(
-        axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)]
+        axes, ["a"], [ResultRow("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)]
     )
     low, high = axes.get_xlim()
     labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
@@ -64,7 +64,7 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
 
 
 def test_next_participant_has_trials_left_or_is_new(tmp_path):
-    store, trials = Store(tmp_path), len(plan_trials(SMALL, 1))
+    store, trials = TrialStore(tmp_path), len(plan_trials(SMALL, 1))
     assert next_participant(store, trials) == 1
     go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
     assert next_participant(store, trials) == 2
@@ -76,7 +76,7 @@ def test_shares_have_arithmetic_means_and_times_geometric_ones(tmp_path):
     """Failed and practice trials have no time; t(0.975, 1) = 12.706."""
     experiment, store = (
         Experiment(tasks=[PegInSlot()], conditions=[Condition(name="a")]),
-        Store(tmp_path),
+        TrialStore(tmp_path),
     )
     for number, done, time in ((1, (1, 1, 1, 0), 2.0), (2, (0, 0, 1, 0), 8.0)):
         rows = [

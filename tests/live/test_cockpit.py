@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.session import Session
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
@@ -21,12 +21,12 @@ def rows(scenario, load):
     session = Session(scenario, load)
     session.advance()
     rows = session.new_rows()
-    assert Cockpit(scenario).page_values(rows, Inputs())["words"] == []
+    assert PageValueCalculator(scenario).page_values(rows, Inputs())["words"] == []
     return rows
 
 
 def words(scenario, rows, inputs=Inputs()):  # noqa: B008 (it does not change)
-    return Cockpit(scenario).page_values(rows, inputs)["words"]
+    return PageValueCalculator(scenario).page_values(rows, inputs)["words"]
 
 
 def test_joints_at_their_limits_are_named(scenario, rows):
@@ -72,5 +72,5 @@ def test_forces_are_at_the_hands_scale_without_sensor_offset(scenario, rows):
         rows[name] = np.zeros((n, 6))
         rows[name][0, :3], rows[name][1:, :3] = first, last
     rows["load_estimate"] = np.tile([10.0, *np.zeros(15)], (n, 1))
-    frame = Cockpit(scenario).page_values(rows, Inputs(force_scale=50_000))
+    frame = PageValueCalculator(scenario).page_values(rows, Inputs(force_scale=50_000))
     assert frame["f"] == [[2.5, 6.5], [0.0, 5.0], [1.0, 2.0]] and frame["contact"]

@@ -15,7 +15,7 @@ from websockets.sync.server import serve
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.live.device_client import DeviceClient
-from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceConnection, DeviceLink
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
@@ -27,7 +27,7 @@ from drake_teleop.live.device_packets import (
     unpack_force,
     unpack_state,
 )
-from drake_teleop.live.haply import HaplyDevice, make_force_message, read_message
+from drake_teleop.live.haply import HaplyDevice, make_force_message, parse_device_message
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_task_space_device
@@ -107,18 +107,18 @@ def test_invalid_packets_only_change_a_counter(link):
                 else 0.0
             )
     assert link.refused > 40
-    assert read_message(said).state.position == (-2.0, 1.0, 3.0)
+    assert parse_device_message(said).state.position == (-2.0, 1.0, 3.0)
     texts = ["", "[]", "{}", "null", "[" * 9000, '{"inverse3":[]}', said[:-1], "1e999", 7, None]
     texts += [said.replace(*pair) for pair in (("1,", "NaN,"), ("2", '"2"'), ("3}", "1e400}"))]
     for text in texts:
-        assert read_message(text) is None
+        assert parse_device_message(text) is None
     for places, values in zip(
         random.integers(0, len(said), (500, 3)), random.integers(32, 127, (500, 3)), strict=True
     ):
         letters = list(said)
         for place, value in zip(places, values, strict=True):
             letters[place] = chr(value)
-        heard = read_message("".join(letters))
+        heard = parse_device_message("".join(letters))
         assert heard is None or np.isfinite(heard.state.position).all()
 
 
@@ -128,7 +128,11 @@ def test_force_and_position_of_haply_use_the_same_axes():
     assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
         "x": 2.0, "y": -1.0, "z": 3.0,
     }  # fmt: skip
-    assert read_message(json.dumps({"inverse3": [device]})).state.position == (1.0, 2.0, 3.0)
+    assert parse_device_message(json.dumps({"inverse3": [device]})).state.position == (
+        1.0,
+        2.0,
+        3.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -195,7 +199,7 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
 
 
 def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
-    guard, last = DeviceGuard(Limits(5.0, 0.1, slew=1000.0, torque_slew=10.0)), np.zeros(6)
+    guard, last = DeviceGuard(DeviceLimits(5.0, 0.1, slew=1000.0, torque_slew=10.0)), np.zeros(6)
     for k in range(300):
         wrench = (np.nan,) * 6 if k % 50 == 7 else (40.0, -30.0, 0.0, 1.0, 0.0, 0.0)
         age = MS * max(k - 150, 0) if k < 250 else 0.0
@@ -226,7 +230,7 @@ def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
     ("axis", "force", "pressed"), [(0, 4.0, 0.2), (2, -9.0, 0.1), (1, 6.0, 0.02)]
 )
 def test_at_most_300_mJ_of_stored_energy_return(axis, force, pressed):
-    guard, position, wrench = DeviceGuard(Limits(10.0, slew=1e9)), np.zeros(3), np.zeros(6)
+    guard, position, wrench = DeviceGuard(DeviceLimits(10.0, slew=1e9)), np.zeros(3), np.zeros(6)
     wrench[axis] = force
     for _ in range(200):
         guard.limit_wrench(position, wrench, 0.0, MS)
@@ -244,7 +248,7 @@ def test_at_most_300_mJ_of_stored_energy_return(axis, force, pressed):
 def tap_on_wall(stiffness, grip, delay, *, observe):
     """Return the least energy of the port and the final speed after one tap on a wall."""
     virtual = VirtualDevice(tapping_motion(0.02, hertz=1.0), grip)
-    guard, heights = DeviceGuard(Limits(37.5), observe=observe), [virtual.position[2]] * delay
+    guard, heights = DeviceGuard(DeviceLimits(37.5), observe=observe), [virtual.position[2]] * delay
     energy, speed = [], []
     for k in range(950):
         heights.append(virtual.position[2])
@@ -271,7 +275,7 @@ def test_a_stiff_wall_comes_to_rest():
 class RestingDevice:
     """Device at rest that records the displayed wrenches."""
 
-    limits = Limits(10.0)
+    limits = DeviceLimits(10.0)
 
     def __init__(self):
         self.was_set = []
@@ -301,7 +305,7 @@ def test_client_displays_the_stations_force_and_none_after_silence(link):
     force = [wrench[2] for wrench in device.was_set]
     assert force[99] == pytest.approx(4.0)
     assert max(np.abs(force[151:])) == 0.0
-    assert 1 / 1.1 < 1000 * client.behind[50] < 1.1
+    assert 1 / 1.1 < 1000 * client.force_ages_s[50] < 1.1
     client.close()
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drake_teleop.live.external_master import (
-    _ALLOWED,
-    _DISPLAY,
-    _FAULT,
+    _ALLOWED_SHARE,
+    _DISPLAY_STATE_SIZE,
+    _FAULT_INDEX,
     MakeExternalMasterSide,
     _update_displayed_wrench,
 )
@@ -20,9 +20,9 @@ PERIOD = 1e-3
 @pytest.mark.parametrize("limits", [(10.0, 0.2), (3.0, 5.0)])
 @pytest.mark.parametrize("wrench", [(0.0, 80.0, -60.0, 0.0, 4.0, 3.0), (0.3, 0, 0, 0, 0, 0.02)])
 def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
-    wrench, last, shown = np.array(wrench, float), np.zeros(_DISPLAY), []
+    wrench, last, shown = np.array(wrench, float), np.zeros(_DISPLAY_STATE_SIZE), []
     for k in range(500):
-        now, held = np.empty(_DISPLAY), k < 400
+        now, held = np.empty(_DISPLAY_STATE_SIZE), k < 400
         _update_displayed_wrench(wrench, held, PERIOD, np.array(limits), last, now)
         shown.append(now)
         last = now
@@ -39,12 +39,12 @@ def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
 @pytest.mark.parametrize("place", range(6))
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_wrench_that_is_not_finite_is_a_fault_and_fades(place, value):
-    last, now, wrench = np.zeros(_DISPLAY), np.empty(_DISPLAY), np.ones(6)
-    last[0], last[_ALLOWED] = 2.0, 1.0
+    last, now, wrench = np.zeros(_DISPLAY_STATE_SIZE), np.empty(_DISPLAY_STATE_SIZE), np.ones(6)
+    last[0], last[_ALLOWED_SHARE] = 2.0, 1.0
     wrench[place] = value
     _update_displayed_wrench(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
-    assert now[_FAULT] > 0.0
-    assert now[_ALLOWED] == pytest.approx(0.98)
+    assert now[_FAULT_INDEX] > 0.0
+    assert now[_ALLOWED_SHARE] == pytest.approx(0.98)
     np.testing.assert_allclose(now[:6], [2.0 - 0.15 * 4.0, 0, 0, 0, 0, 0])
 
 

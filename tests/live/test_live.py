@@ -127,7 +127,7 @@ def test_removed_force_is_reported(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
     assert pass_time(live, clock, FRAME_PERIOD_S)[-1]["words"] == []
-    monkeypatch.setattr(Session, "removed_force", lambda session: 1.234)
+    monkeypatch.setattr(Session, "force_above_limit", lambda session: 1.234)
     said = "1.2 N are not rendered until the hand presses less"
     assert pass_time(live, clock, FRAME_PERIOD_S)[-1]["words"] == [said]
 
@@ -274,17 +274,17 @@ def test_short_delays_are_caught_up_and_long_ones_given_up():
     pace = Pace(5e-3, 0.0)
     for k in range(10):
         pace.begin_slice(5e-3 * k)
-    assert pace.real_time_factor == pytest.approx(1.0) and pace.lateness() == pytest.approx(
+    assert pace.real_time_factor == pytest.approx(1.0) and pace.lateness_p99_s() == pytest.approx(
         0.0, abs=1e-12
     )
     pace.begin_slice(0.09)  # 40 ms late: the next ones are due at once
-    assert pace.time_to_next_slice(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
+    assert pace.time_to_next_slice(0.09) == pytest.approx(-0.035) and pace.lost_time_s == 0.0
     pace.begin_slice(0.3)
-    assert pace.given_up == pytest.approx(0.245) and pace.time_to_next_slice(0.3) == pytest.approx(
-        5e-3
-    )
-    assert pace.real_time_factor < 0.2 and pace.lateness() == pytest.approx(0.245)
-    pace.slow = 4.0
+    assert pace.lost_time_s == pytest.approx(0.245) and pace.time_to_next_slice(
+        0.3
+    ) == pytest.approx(5e-3)
+    assert pace.real_time_factor < 0.2 and pace.lateness_p99_s() == pytest.approx(0.245)
+    pace.slowdown = 4.0
     pace.begin_slice(0.305)
     assert pace.time_to_next_slice(0.305) == pytest.approx(0.02)
 

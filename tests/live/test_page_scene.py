@@ -33,7 +33,7 @@ def rows(scenario, load) -> dict[str, np.ndarray]:
 def test_moving_objects_have_the_poses_of_the_station(scenario, view, rows):
     objects = json.loads(view.objects)
     commands = [base64.b64decode(text) for text in objects["commands"]]
-    frame = view.show(rows)
+    frame = view.frame_part(rows)
     moves = frame["moves"]
     assert (frame["view"], frame["no_view"], view.failure) == ("own", "", "")
     for path in (*moves["poses"], *moves["sizes"]):
@@ -44,14 +44,14 @@ def test_moving_objects_have_the_poses_of_the_station(scenario, view, rows):
     X_WTool = tool.reshape(4, 4).T
     assert np.linalg.norm(X_WTool[:3, 3] - p_WS) < 0.2
     np.testing.assert_allclose(X_WTool[:3, :3].T @ X_WTool[:3, :3], np.eye(3), atol=1e-4)
-    earlier = view.show({name: values[:1] for name, values in rows.items()})["moves"]["poses"]
+    earlier = view.frame_part({name: values[:1] for name, values in rows.items()})["moves"]["poses"]
     moved = [path for path in earlier if earlier[path] != moves["poses"][path]]
     assert len(moved) > 10 and sum("arm" in path or "link" in path for path in moved) > 3
     json.dumps(frame, allow_nan=False)
 
 
 def test_scene_without_forces_has_no_arrow(scenario, rows):
-    moves = PageScene("0", scenario, forces=False).show(rows)["moves"]
+    moves = PageScene("0", scenario, forces=False).frame_part(rows)["moves"]
     assert not moves["sizes"] and not any("forces" in path for path in moves["poses"])
 
 
@@ -61,14 +61,14 @@ def test_meshcat_is_closed_after_the_scene_is_made(scenario):
     assert ports() == before
 
 
-@pytest.mark.parametrize("broken", ["Meshcat", "ReplayScene", "_extract_objects"])
+@pytest.mark.parametrize("broken", ["Meshcat", "ReplayScene", "_scene_objects_json"])
 def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, capsys, broken):
     def fail(*_, **__):
         raise RuntimeError("no port is free\nfor this")
 
     monkeypatch.setattr(page_scene, broken, fail)
     view = PageScene("own", scenario)
-    assert view.show(rows) == {
+    assert view.frame_part(rows) == {
         "view": "own", "no_view": "no 3D scene: no port is free for this", "moves": {},
     }  # fmt: skip
     said = capsys.readouterr().err
@@ -78,7 +78,9 @@ def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, 
 def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):
     view = PageScene("own", scenario)
     for _ in range(3):
-        frame = view.show({name: values for name, values in rows.items() if name != "slave_state"})
+        frame = view.frame_part(
+            {name: values for name, values in rows.items() if name != "slave_state"}
+        )
     assert frame["no_view"] == "no 3D scene: 'slave_state'" and frame["moves"] == {}
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -86,7 +88,7 @@ def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):
 @pytest.mark.parametrize("name", ["slave_state", "master_state", "contact_wrench_S"])
 def test_non_finite_poses_are_not_sent(view, rows, name):
     for value in (np.nan, np.inf):
-        wild = view.show(rows | {name: np.full_like(rows[name], value)})
+        wild = view.frame_part(rows | {name: np.full_like(rows[name], value)})
         json.dumps(wild, allow_nan=False)
         assert wild["moves"] == {}
-    assert view.show(rows)["moves"]
+    assert view.frame_part(rows)["moves"]

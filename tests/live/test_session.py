@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.live.hand import LEAD_TIME_S
+from drake_teleop.live.hand import TARGET_LEAD_TIME_S
 from drake_teleop.live.inputs import (
     INPUT_RANGES,
     INPUTS_FILE,
@@ -23,7 +23,7 @@ from drake_teleop.live.inputs import (
     csv_row,
     read_inputs,
 )
-from drake_teleop.live.session import Drive, Session, read_drive
+from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS
@@ -82,7 +82,7 @@ def test_recorded_drive_repeats_for_any_slices(driven, scenario, load):
     assert len(log.t) == END + 1 and np.abs(log["true_contact_wrench_W"][:, 2]).max() > 5.0
     # One input one slice late is another drive.
     late = [(ms + 5 * (ms == 100), inputs) for ms, inputs in script(scenario)]
-    assert not same(Drive(scenario, load, late).repeat(show_no_progress("")), log)
+    assert not same(RecordedDrive(scenario, load, late).repeat(show_no_progress("")), log)
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
         session.apply_inputs(session.inputs.with_changes(changes))
         session.advance(ms)
         rendered.append(float(np.linalg.norm(session.device_wrench()[:3])))
-        return session.removed_force()
+        return session.force_above_limit()
 
     assert simulate(500, z=-4000) == 0.0
     assert simulate(1000, network=2, method=list(METHODS).index("force_limit")) == 0.0
@@ -183,7 +183,9 @@ def test_tool_follows_the_target_without_lag_and_stops_at_it(scenario, load):
     session.advance(50)
     for ms in range(200):
         session.apply_inputs(
-            session.inputs.with_changes({"x": round(1e5 * speed * (1e-3 * ms + LEAD_TIME_S))})
+            session.inputs.with_changes(
+                {"x": round(1e5 * speed * (1e-3 * ms + TARGET_LEAD_TIME_S))}
+            )
         )
         session.advance(1)
     session.apply_inputs(session.inputs.with_changes({"x": round(1e5 * speed * 0.2)}))

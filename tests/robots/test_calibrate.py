@@ -28,7 +28,12 @@ from drake_teleop.load.tolerance import (
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import PartStreams
-from drake_teleop.robots.calibration import Evaluation, advise_motion, calibrate, evaluate_record
+from drake_teleop.robots.calibration import (
+    RecordEvaluation,
+    advise_motion,
+    calibrate,
+    evaluate_record,
+)
 from drake_teleop.robots.recording import PartRecorder, ReadingRecorder
 from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Part, Reading, ReadingFlag
 
@@ -78,15 +83,19 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     recorder = ReadingRecorder()
     looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, TOLERANCE)
     assert recorder.longest_part_s < 8.0
-    assert [at.sure.all() for at in looks[-3:]] == [False, True, True]
-    assert [at.known.all() for at in looks[-3:]] == [False, False, True]
+    assert [at.is_within_tolerance.all() for at in looks[-3:]] == [False, True, True]
+    assert [at.is_known.all() for at in looks[-3:]] == [False, False, True]
     last = looks[-1]
-    assert last.found is not None and last.advice == "" and all(at.advice for at in looks[:-2])
+    assert (
+        last.identified_log is not None
+        and last.advice == ""
+        and all(at.advice for at in looks[:-2])
+    )
     again = identify_log(path).identification
-    np.testing.assert_array_equal(last.found.identification.phi, again.phi)
+    np.testing.assert_array_equal(last.identified_log.identification.phi, again.phi)
     error = required_values(TOLERANCE, again.phi) - required_values(TOLERANCE, PHI)
     assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
-    assert last.t == pytest.approx(identify_log(path).log.t[-1])
+    assert last.record_length_s == pytest.approx(identify_log(path).log.t[-1])
 
 
 class Live(Stream):
@@ -102,7 +111,7 @@ class Live(Stream):
 
 
 def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> None:
-    path = tmp_path / ReadingRecorder.file
+    path = tmp_path / ReadingRecorder.log_file_name
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
             calibrate(Live(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
@@ -113,7 +122,7 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def evaluate(values: np.ndarray, until: str, path: Path) -> Evaluation:
+def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:
     log = Log(DT * np.arange(len(values)), *np.split(values, [6, 9, 12], axis=1))
     write_log(log, path)
     return evaluate_record(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
@@ -122,7 +131,11 @@ def evaluate(values: np.ndarray, until: str, path: Path) -> Evaluation:
 def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -> None:
     at = evaluate(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
     known = dict(
-        zip(read_tolerance("mass 5 %, inertia 20 %").required_entries, at.sure, strict=True)
+        zip(
+            read_tolerance("mass 5 %, inertia 20 %").required_entries,
+            at.is_within_tolerance,
+            strict=True,
+        )
     )
     assert known["mass"] and known["inertia xy"]
     assert not any(known[f"inertia {axes}"] for axes in ("xx", "xz", "zz"))
@@ -134,7 +147,7 @@ def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -
 def test_no_parameter_is_known_after_a_change_of_load(tmp_path: Path) -> None:
     both = np.concatenate([recorded(3.0, [0, 1, 2]), recorded(3.0, [0, 1, 2], phi=1.5 * PHI)])
     at = evaluate(both, "mass 1000 %", tmp_path / "log.parquet")
-    assert at.half < 1.0 and not at.sure.any()
+    assert at.relative_half_widths < 1.0 and not at.is_within_tolerance.any()
     assert at.doubts[0].startswith("from t = 3.00 s on there is another load")
     assert (
         at.advice == "start again: the record has another zero or another load from t = 3.00 s on"
@@ -153,9 +166,9 @@ def test_excluded_contact_causes_no_doubt(tmp_path: Path) -> None:
     values = recorded(6.0, [0, 1, 2])
     values[:, :6] += contact(6.0)
     at = evaluate(values, "mass 0.5 %", tmp_path / "log.parquet")
-    assert at.found is not None
-    assert [cause.name for cause in at.found.causes] == ["contact"]
-    assert at.doubts == () and at.sure.all() and at.advice == ""
+    assert at.identified_log is not None
+    assert [cause.name for cause in at.identified_log.causes] == ["contact"]
+    assert at.doubts == () and at.is_within_tolerance.all() and at.advice == ""
 
 
 @pytest.mark.long
@@ -232,8 +245,8 @@ def test_longest_part_is_written_after_a_clock_change(
     recorder = take(ReadingRecorder(), (0.0, first), (1e6, 1), (500.0, second))
     assert (recorder.left_out, recorder.clock_changes) == (1, 1)
     assert recorder.longest_part_s == pytest.approx(799 * DT)
-    recorder.write(tmp_path / recorder.file)
-    assert len(pl.read_parquet(tmp_path / recorder.file)) == 800
+    recorder.write(tmp_path / recorder.log_file_name)
+    assert len(pl.read_parquet(tmp_path / recorder.log_file_name)) == 800
 
 
 def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
@@ -290,8 +303,8 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     ):
         recorder.add((Part(stream, 0, 2.1, values, int(flags)), 2.1))
     assert recorder.left_out == 3 and recorder.clock_changes == 0
-    recorder.write(tmp_path / recorder.file)
-    found = identify_log(tmp_path / recorder.file)
+    recorder.write(tmp_path / recorder.log_file_name)
+    found = identify_log(tmp_path / recorder.log_file_name)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
     error = required_values(TOLERANCE, found.identification.phi) - required_values(TOLERANCE, PHI)
     assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()

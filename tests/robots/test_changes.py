@@ -18,7 +18,7 @@ from drake_teleop.robots import changes
 from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensate import compensate_stream, run_compensate_command
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.streams import Compensated, Reading, ReadingFlag
+from drake_teleop.robots.streams import CompensatedWrench, Reading, ReadingFlag
 from drake_teleop.robots.watch import ContactAndLoadMonitor
 
 OBJECT = phi_from_mass_com_inertia(0.4, [0.0, 0.01, 0.15], np.diag([1e-3, 1e-3, 5e-4]))
@@ -67,9 +67,9 @@ class ListSink:
     """Sink that stores all outputs."""
 
     def __init__(self) -> None:
-        self.out: list[Compensated] = []
+        self.out: list[CompensatedWrench] = []
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self.out.append(out)
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class ListSink:
 
 def compensated(
     values: Values, *, looked_for: bool = True, live: bool = False
-) -> tuple[list[Compensated], list[str]]:
+) -> tuple[list[CompensatedWrench], list[str]]:
     """Return outputs and reports."""
     messages: list[str] = []
     sought = ChangeMonitor(DT, live=live, report=messages.append) if looked_for else None

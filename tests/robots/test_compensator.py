@@ -21,7 +21,7 @@ from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import DAMAGED_READING, Compensated, Reading, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_READING, CompensatedWrench, Reading, ReadingFlag
 
 DT, DELAY = 0.002, 0.0051
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -61,9 +61,9 @@ class ListSink:
     """Sink that stores all outputs."""
 
     def __init__(self) -> None:
-        self.rows: list[Compensated] = []
+        self.rows: list[CompensatedWrench] = []
 
-    def write(self, out: Compensated) -> None:
+    def write(self, out: CompensatedWrench) -> None:
         self.rows.append(out)
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from shown import type_in
 from drake_teleop.cli.main import main
 from drake_teleop.common.compiled import njit
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.compensation_step import TOO_FAR, VARIES
+from drake_teleop.robots.compensation_step import TARE_EXCEEDS_DRIFT, TARE_WRENCH_VARIES
 from drake_teleop.robots.controller.c99 import CFLAGS, kernel_files
 from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
 from drake_teleop.robots.streams import Reading, ReadingFlag
@@ -117,12 +117,17 @@ int main(void) {
 @needs_cc
 @pytest.mark.parametrize(
     ("noise", "shift", "reading", "state"),
-    [(0.01, 0.5, 0, 0), (0.01, 0.5, 7, 4), (0.01, 6.0, 0, TOO_FAR), (1.0, 0.5, 0, VARIES)],
+    [
+        (0.01, 0.5, 0, 0),
+        (0.01, 0.5, 7, 4),
+        (0.01, 6.0, 0, TARE_EXCEEDS_DRIFT),
+        (1.0, 0.5, 0, TARE_WRENCH_VARIES),
+    ],
     ids=["done", "runs after an invalid reading", "too far", "varies"],
 )
 def test_tare_equals_that_of_python(tmp_path, noise, shift, reading, state):
     loop = kernel.TARGET.make_compensator()
-    count = int(loop.settings["tare_steps"])
+    count = int(loop.c_settings["tare_steps"])
     rows = np.zeros((count, 15))
     rows[:, 8] = 9.81
     rows[:, :6] = non_contact_wrench(*rows[0].reshape(5, 3)[2:], kernel.PHI) + kernel.OFFSETS

@@ -17,7 +17,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY, export_text
+from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY_M_S2, export_load
 
 MASS, COM = 1.7, np.array([0.012, -0.034, 0.091])
 INERTIA = np.array([[4.1e-3, 3e-4, -2e-4], [3e-4, 5.2e-3, 1e-4], [-2e-4, 1e-4, 3.3e-3]])
@@ -103,7 +103,7 @@ def by_ft_tools(text: str) -> Values:
 def by_admittance(text: str) -> Values:
     told = yaml.safe_load(text)["admittance_controller"]["ros__parameters"]
     centre = told["gravity_compensation"]["CoG"]
-    return centre["force"] / STANDARD_GRAVITY, centre["pos"], None
+    return centre["force"] / STANDARD_GRAVITY_M_S2, centre["pos"], None
 
 
 def by_bota(text: str) -> Values:
@@ -135,7 +135,7 @@ def test_exported_load_is_read_back(name):
     """Relative error 1e-9, with a rotated and shifted sensor where allowed."""
     target, _, other = name.partition(" ")
     of_sensor = FORMATS[target].of_sensor
-    text, warnings = export_text(FOUND, target, **({} if of_sensor else TURNED))
+    text, warnings = export_load(FOUND, target, **({} if of_sensor else TURNED))
     assert FORMATS[target].inertia == (not any("no field for" in text for text in warnings))
     mass, com, inertia = (by_mujoco if other else READERS[target])(text)
     com_0, inertia_0 = (COM, INERTIA) if of_sensor else in_flange()
@@ -147,14 +147,14 @@ def test_exported_load_is_read_back(name):
 
 
 def test_ur_and_xarm_export_a_function_call():
-    text, _ = export_text(FOUND, "ur", **TURNED)
+    text, _ = export_load(FOUND, "ur", **TURNED)
     assert re.fullmatch(r"set_target_payload\([^,]+, \[([^,]+, ){2}[^,]+\], \[.*\]\)\n", text)
-    text, warnings = export_text(FOUND, "xarm", **TURNED)
+    text, warnings = export_load(FOUND, "xarm", **TURNED)
     assert "no field for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
 
 
 def test_franka_exports_the_identity_transformation():
-    read = json.loads(export_text(FOUND, "franka", **TURNED)[0])
+    read = json.loads(export_load(FOUND, "franka", **TURNED)[0])
     np.testing.assert_array_equal(np.reshape(read["transformation"], (4, 4), "F"), np.eye(4))
 
 
@@ -164,7 +164,7 @@ def test_exported_compensation_cancels_the_reading(sign):
     g = X_FS.rotation().matrix()[2] * -9.81
     held = np.concatenate([-MASS * g, np.cross(COM, -MASS * g)]) + OFFSETS
     reading = sign * held
-    tools = yaml.safe_load(export_text(FOUND, "ft_tools", sign=sign)[0])
+    tools = yaml.safe_load(export_load(FOUND, "ft_tools", sign=sign)[0])
     offset = np.array([*tools["force_offset"], *tools["torque_offset"]])
     weight = tools["mass"] * g
     # As ft_tools has it: the load pulls at the sensor.
@@ -173,32 +173,32 @@ def test_exported_compensation_cancels_the_reading(sign):
     )
     if sign == -1:
         np.testing.assert_allclose(left, 0.0, atol=1e-12)
-    kth = yaml.safe_load(export_text(FOUND, "kth", sign=sign)[0])
+    kth = yaml.safe_load(export_load(FOUND, "kth", sign=sign)[0])
     np.testing.assert_allclose(kth["bias"], sign * OFFSETS, atol=1e-15)
-    bota = json.loads(export_text(FOUND, "bota", sign=sign)[0])["payload_compensator_config"]
+    bota = json.loads(export_load(FOUND, "bota", sign=sign)[0])["payload_compensator_config"]
     assert list(bota["payload_properties"]["bias"].values()) == pytest.approx(sign * OFFSETS)
 
 
 def test_unidentified_values_cause_warnings():
     unsure = dataclasses.replace(FOUND, identifiable=np.arange(16) != 10, covariance=np.eye(16))
     for name, told in (("ur", True), ("xarm", False)):
-        text, warnings = export_text(unsure, name)
+        text, warnings = export_load(unsure, name)
         assert any(w.startswith("I_xx is not identified") for w in warnings) == told
         assert ("I_xx" in text) == told
-    assert not any("f_ox" in text for text in export_text(unsure, "ur")[1])
+    assert not any("f_ox" in text for text in export_load(unsure, "ur")[1])
 
 
 def test_inconsistent_load_and_wrong_target_raise_one_line():
     nobody = dataclasses.replace(FOUND, phi=FOUND.phi * [1, 1, 1, 1, -1, 1, 1, 1, 1, 1])
     with pytest.raises(DrakeTeleopError, match=r"not physically consistent.*consistent"):
-        export_text(nobody, "urdf")
-    assert any("not physically consistent" in text for text in export_text(nobody, "ur")[1])
+        export_load(nobody, "urdf")
+    assert any("not physically consistent" in text for text in export_load(nobody, "ur")[1])
     with pytest.raises(DrakeTeleopError, match="the sign of the wrench is wrong"):
-        export_text(dataclasses.replace(FOUND, phi=-FOUND.phi), "ur")
+        export_load(dataclasses.replace(FOUND, phi=-FOUND.phi), "ur")
     with pytest.raises(DrakeTeleopError, match="kth takes its values in the sensor's frame"):
-        export_text(FOUND, "kth", **TURNED)
+        export_load(FOUND, "kth", **TURNED)
     with pytest.raises(DrakeTeleopError, match=r"there is no export format 'kuka'.*ur, franka"):
-        export_text(FOUND, "kuka")
+        export_load(FOUND, "kuka")
 
 
 def test_command_prints_text_and_warnings(tmp_path, capsys):
@@ -209,7 +209,7 @@ def test_command_prints_text_and_warnings(tmp_path, capsys):
             main(["export", str(tmp_path / "load.json"), "--to", name, *pose])
         assert exit.value.code == 0
         printed = capsys.readouterr()
-        text, warnings = export_text(FOUND, name, **({} if FORMATS[name].of_sensor else TURNED))
+        text, warnings = export_load(FOUND, name, **({} if FORMATS[name].of_sensor else TURNED))
         numbers = re.compile(r"-?\d+\.\d+(?:e-\d+)?")
         np.testing.assert_allclose(
             [float(n) for n in numbers.findall(printed.out)],
@@ -226,6 +226,6 @@ def test_removed_weight_is_not_subtracted_again(to) -> None:
     weightless = dataclasses.replace(FOUND, weight_removed=True)
     if FORMATS[to].of_sensor:
         with pytest.raises(DrakeTeleopError, match=f"{to} would subtract it once more"):
-            export_text(weightless, to)
+            export_load(weightless, to)
     else:
-        assert export_text(weightless, to) == export_text(FOUND, to)
+        assert export_load(weightless, to) == export_load(FOUND, to)

@@ -21,7 +21,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
-from drake_teleop.robots.assembly import Assembly, PartStreams, PosedByJoints
+from drake_teleop.robots.assembly import PartStreams, PoseSourceFromJoints, ReadingAssembler
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
@@ -117,13 +117,13 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     t, *joints = moved(0.4)
     bad = Part(POSE, 0, 0.0, np.zeros(7)), Part(JOINTS, 0, 0.0, np.full(3, 0.1))
     parts = [Part(JOINTS, k, float(t[k]), q) for k, q in enumerate(joints[0])]
-    source = PosedByJoints(Joints([*bad, *parts]), arm)
+    source = PoseSourceFromJoints(Joints([*bad, *parts]), arm)
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = Assembly(PartStreams(source)), []
+    assembly, found = ReadingAssembler(PartStreams(source)), []
     for k, part in enumerate(sent[1:]):
-        found += assembly.complete_readings(part, part.t) + assembly.complete_readings(
+        found += assembly.readings_completed_by(part, part.t) + assembly.readings_completed_by(
             Part(WRENCH, k, part.t, np.zeros(6)), part.t
         )
     good = [each for each in found if not each.flags]

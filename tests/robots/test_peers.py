@@ -28,14 +28,14 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
-from drake_teleop.robots.netft import NetFtSource, parse_sensor_page
+from drake_teleop.robots.netft import NetFtSource, parse_counts_and_rate
 from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,
     WRENCH,
-    Compensated,
+    CompensatedWrench,
     Part,
     Reading,
     ReadingFlag,
@@ -62,7 +62,7 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
             process.kill()
 
 
-class Seen(list[Compensated]):
+class Seen(list[CompensatedWrench]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(
@@ -96,7 +96,7 @@ class Seen(list[Compensated]):
                 if begun and not out.flags and out.number >= last:
                     return
 
-    def _take(self, out: Compensated) -> Compensated:
+    def _take(self, out: CompensatedWrench) -> CompensatedWrench:
         self.append(out)
         self.at.append(time.monotonic())
         return out
@@ -205,7 +205,7 @@ def test_ros_2_node_receives_the_wrench() -> None:
         reader = threading.Thread(target=lambda: seen.extend(lines))
         reader.start()
         while reader.is_alive():
-            sink.write(Compensated(1, 0.0, wrench, -wrench, 0))
+            sink.write(CompensatedWrench(1, 0.0, wrench, -wrench, 0))
             reader.join(0.01)
         sink.close()
     kind = f"geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_{HASH}"
@@ -223,7 +223,7 @@ def test_ros_2_node_receives_the_wrench() -> None:
 
 def test_foxglove_and_mcap(tmp_path: Path) -> None:
     path = tmp_path / "new" / "out.mcap"
-    rows = [Compensated(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
+    rows = [CompensatedWrench(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
     file, live = open_sink(str(path)), open_sink("foxglove://127.0.0.1:0")
     with connect(f"ws://127.0.0.1:{live.port}", subprotocols=["foxglove.sdk.v1"]) as page:
         page.recv()
@@ -285,9 +285,9 @@ def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
 def test_netft_page_contains_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
-    assert parse_sensor_page(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+    assert parse_counts_and_rate(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
-            parse_sensor_page(bad)
+            parse_counts_and_rate(bad)
     with pytest.raises(DrakeTeleopError, match=r"page .*; check the host, or give netft://HOST"):
         NetFtSource("netft://127.0.0.9")

@@ -19,7 +19,7 @@ from test_calibrate import DT, PHI, recorded
 from test_compensator import OFFSETS, load, resting
 
 from drake_teleop.robots import udp
-from drake_teleop.robots.streams import POSE, WRENCH, Compensated, Part, Reading
+from drake_teleop.robots.streams import POSE, WRENCH, CompensatedWrench, Part, Reading
 
 pytestmark = pytest.mark.slow
 TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
@@ -46,7 +46,7 @@ class Peer:
     def __init__(
         self, packets: list[bytes], each_s: float, answers: socket.socket | None = None
     ) -> None:
-        self.heard: list[Compensated] = []
+        self.heard: list[CompensatedWrench] = []
         self._packets, self._each_s, self._answers = packets, each_s, answers
         self._over, self._thread = threading.Event(), threading.Thread(target=self._play)
 

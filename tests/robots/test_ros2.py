@@ -27,7 +27,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import MessageConverter
-from drake_teleop.robots.streams import NONZERO_FLAGS, POSE, Compensated, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, POSE, CompensatedWrench, ReadingFlag
 
 PEER = Path(__file__).with_name("ros2_peer.py")
 DOMAIN = str(os.getpid() % 100 + 1)
@@ -74,8 +74,8 @@ def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
         seen = Echo(peer)
 
         def write(flags: int) -> None:
-            zero = flags & ~NONZERO_FLAGS
-            sink.write(Compensated(7, 0.5, wrench * (not zero), -wrench, flags))
+            zero = flags & ~NONZERO_WRENCH_FLAGS
+            sink.write(CompensatedWrench(7, 0.5, wrench * (not zero), -wrench, flags))
 
         seen.wait(lambda: any("wrench" in row for row in seen), lambda: write(0))
         seen.wait(lambda: any(row.get("message") == "ok" for row in seen), lambda: write(0), 30)
@@ -90,7 +90,7 @@ def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
     assert abs(first["t"] - time.time()) < 600.0
     levels = {row["message"]: row["level"] for row in seen if "message" in row}
     for flag in ReadingFlag:
-        expected = 1 if flag & NONZERO_FLAGS else 3 if flag == ReadingFlag.STALE else 2
+        expected = 1 if flag & NONZERO_WRENCH_FLAGS else 3 if flag == ReadingFlag.STALE else 2
         assert levels[flag_names(flag)[0]] == expected
     assert levels["ok"] == 0
     last = [row for row in seen if "message" in row][-1]

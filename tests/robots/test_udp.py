@@ -33,12 +33,12 @@ from drake_teleop.robots.compensate import (
 )
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink, open_source
-from drake_teleop.robots.lines import LineSource, parse_reading, wrench_line
+from drake_teleop.robots.lines import JsonLineSource, reading_of_json_line, wrench_json_line
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
     POSE,
     WRENCH,
-    Compensated,
+    CompensatedWrench,
     Part,
     Reading,
     ReadingFlag,
@@ -58,13 +58,13 @@ def test_packets_and_lines_are_read_back() -> None:
     back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(ReadingFlag.SATURATED))))
     assert back[:2] == reading[:2] and back.flags == ReadingFlag.SATURATED
     np.testing.assert_array_equal(back.values, reading.values)
-    back = parse_reading(line_of(reading), 7)
+    back = reading_of_json_line(line_of(reading), 7)
     assert back.number == 7
     np.testing.assert_array_equal(back.values, reading.values)
-    out = Compensated(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
+    out = CompensatedWrench(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
     again = udp.unpack_wrench(udp.pack_wrench(out))
     assert again.flags == 34 and again.scaled.tolist() == out.scaled.tolist()
-    assert json.loads(wrench_line(out))["flags"] == ["damaged", "stale"]
+    assert json.loads(wrench_json_line(out))["flags"] == ["damaged", "stale"]
     with pytest.raises(DrakeTeleopError, match="bytes are not a compensated wrench; send"):
         udp.unpack_wrench(b"x")
 
@@ -96,7 +96,9 @@ def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> No
         if rng.random() < 0.1:
             data = data[: rng.randrange(len(data))]
         reading = (
-            udp.unpack_reading(bytes(data)) if kind == "packet" else parse_reading(bytes(data), k)
+            udp.unpack_reading(bytes(data))
+            if kind == "packet"
+            else reading_of_json_line(bytes(data), k)
         )
         out = compensator.step(reading, k * DT)
         assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
@@ -112,14 +114,16 @@ def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> No
     "line", [b"", b"[]", b"3", b"{}", b"\xff", b"[" * 4000, b"{" * 9000, b'{"t":1,"wrench":"x"}']
 )
 def test_invalid_line_is_damaged(line: bytes) -> None:
-    assert parse_reading(line, 0) is DAMAGED_READING
+    assert reading_of_json_line(line, 0) is DAMAGED_READING
 
 
 @pytest.mark.parametrize("number", [2**64, 10**20, -1, 1e300, 10**400, None, "x", [1]])
 def test_number_outside_64_bits_is_damaged(number) -> None:
     line = json.loads(line_of(readings(1)[0]))
-    assert parse_reading(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED_READING
-    largest = parse_reading(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
+    assert (
+        reading_of_json_line(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED_READING
+    )
+    largest = reading_of_json_line(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
     out = Compensator(load(), DT).step(largest, 0.0)
     assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
@@ -176,7 +180,7 @@ def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:
     os.close(into)
     sink, messages = open_sink(str(tmp_path / "x" / "out.csv")), []
     counts = compensate_stream(
-        LineSource(out, DT), Compensator(load(), DT), sink, report=messages.append
+        JsonLineSource(out, DT), Compensator(load(), DT), sink, report=messages.append
     )
     os.close(out)
     sink.close()
@@ -198,11 +202,11 @@ import sys, time
 import numpy as np
 from pathlib import Path
 from drake_teleop.robots import lines
-from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.streams import CompensatedWrench
 lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.02)
 sink = lines.TableSink(Path(sys.argv[1]))
 for k in range(10**6):
-    sink.write(Compensated(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
+    sink.write(CompensatedWrench(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
     print(k, flush=True)
     time.sleep(1e-3)
 """
@@ -236,7 +240,7 @@ class Failing:
     def write_until(self, error: type[BaseException], count: int = 10**6) -> None:
         with pytest.raises(error):
             for k in range(self.written, count):
-                self.sink.write(Compensated(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
+                self.sink.write(CompensatedWrench(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
                 self.written += 1
             raise error
 

@@ -20,7 +20,7 @@ from drake_teleop.lab.excitation.excite import excite
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.run_summary import summarise
-from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.inputs import Inputs
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.scenario import LoadScenario
@@ -288,7 +288,9 @@ def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
     json.dumps(summary, allow_nan=False)
     assert "turns without end for j1, j3, j5, j7" in summary["assumed"]
     rows = {name: run.result[name] for name in run.result.signals} | {"t": run.result.t}
-    json.dumps(Cockpit(setup).page_values(rows, Inputs.from_scenario(setup)), allow_nan=False)
+    json.dumps(
+        PageValueCalculator(setup).page_values(rows, Inputs.from_scenario(setup)), allow_nan=False
+    )
 
 
 def test_one_finite_limit_keeps_the_middle_finite():

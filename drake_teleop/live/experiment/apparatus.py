@@ -6,8 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment.design import (
     ApparentMass,
@@ -25,13 +25,11 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-Array = NDArray[np.float64]
-
 _MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
-_AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
+_FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
-_FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
+_MAX_FLOOR_DISTANCE_M, _MIN_FLOOR_TIME_S = 2e-3, 0.2
 
 
 def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
@@ -41,13 +39,13 @@ def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition; `mass`: fully rendered load at the hand [kg]."""
+    """Station of a task under a condition; `load_mass_at_hand`: fully rendered load [kg]."""
 
     task: Task
     condition: Condition
     scenario: Scenario
     load: IdentifiedLoad | None
-    mass: float
+    load_mass_at_hand: float
 
     def stimulus_inputs(self, level: float, pressed: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
@@ -60,7 +58,7 @@ class Apparatus:
         if isinstance(self.task, ContactDetection):
             gamma = max(1.0, gamma * level / pressed) if level else 0.0
         elif isinstance(self.task, ApparentMass) and level:
-            share += max(1.0, 100.0 * level / self.mass)
+            share += max(1.0, 100.0 * level / self.load_mass_at_hand)
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
@@ -70,16 +68,16 @@ class Apparatus:
         self, shown: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
         """Return the result of an interval; `shown`: intended level (0: no stimulus)."""
-        force = rows.largest_force()
+        force = rows.largest_contact_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
                 force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
             )
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
-            return IntervalResult(level if shown else 0.0, force, valid=force > _TOUCH_FORCE_N)
+            return IntervalResult(level if shown else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
         before = self.condition.sigma if self.condition.eta is None else self.condition.eta
-        level = self.mass * (inputs["sigma_object"] / 100.0 - before)
+        level = self.load_mass_at_hand * (inputs["sigma_object"] / 100.0 - before)
         return IntervalResult(level if shown else 0.0, force)
 
 
@@ -142,18 +140,18 @@ class IntervalLog:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
-        if tip[2] - insert.translation[2] + insert.depth > _FLOOR_DISTANCE_M:
+        if tip[2] - insert.translation[2] + insert.depth > _MAX_FLOOR_DISTANCE_M:
             self._on_floor = None
         elif self._on_floor is None:
             self._on_floor = self.time
-        elif self.time - self._on_floor >= _FLOOR_TIME_S:
+        elif self.time - self._on_floor >= _MIN_FLOOR_TIME_S:
             self.done_at = self._on_floor
 
-    def largest_force(self) -> float:
+    def largest_contact_force(self) -> float:
         """Return the largest 20 ms mean of the contact force [N]."""
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
-    def largest_force_change(self, after: float) -> float:
+    def largest_rendered_force_change(self, after: float) -> float:
         """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
@@ -162,7 +160,7 @@ class IntervalLog:
 
 
 def _largest_moving_mean(values: Array, dt: float) -> float:
-    n = max(1, round(_AVERAGING_S / dt))
+    n = max(1, round(_FORCE_AVERAGING_TIME_S / dt))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[n:] - sums[:-n]) / n
     return float(means.max()) if len(means) else float(values.max())

@@ -14,9 +14,9 @@ from drake_teleop.common.files import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
-from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
+from drake_teleop.live.experiment.procedure import GAP_PHASE, INTERVAL_PHASE, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.station.operator.task import Insert
@@ -28,16 +28,16 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+_BLANK_FRAME_VALUES = {
+    "contact": False,
+    "energy": [0.0, 0.0],
+    "words": [],
+    "record": "",
+    "scene": "own",
+}
 
 #: Names of the inputs that move the hand.
 HAND_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
-
-
-def with_zero_wrenches(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return a log's rows with zero wrenches."""
-    none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
-    return rows | {name: np.zeros_like(rows[name]) for name in none}
 
 
 class GuidedExperiment:
@@ -51,7 +51,7 @@ class GuidedExperiment:
         procedure: Procedure,
         stations: dict[tuple[int, int], Apparatus],
         scenarios: list[Scenario],
-        store: Store,
+        store: TrialStore,
         shows: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
@@ -92,7 +92,8 @@ class GuidedExperiment:
 
     def _add_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add(rows)
-        return self._show(with_zero_wrenches(rows))
+        hidden = ("measured_wrench_S", "load_estimate")
+        return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
 
     def hello(self) -> dict[str, Any]:
         procedure = self._procedure
@@ -120,9 +121,9 @@ class GuidedExperiment:
         self._live.leave(self._driver, now)
         self._driver = None
         self._procedure.restart_trial()
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
 
-    def _prepare_if_changed(self, now: float) -> None:
+    def _prepare_interval_if_changed(self, now: float) -> None:
         with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
                 self._live.end_session()
@@ -145,7 +146,7 @@ class GuidedExperiment:
         if client != self._driver:
             return
         procedure = self._procedure
-        if procedure.phase == INTERVAL:
+        if procedure.phase == INTERVAL_PHASE:
             moves = {kind: message[kind] for kind in message.keys() & {"set", "rates"}}
             self._live.handle_message(client, json.dumps(moves), now)
         before = procedure.phase, procedure.trial_number
@@ -156,9 +157,9 @@ class GuidedExperiment:
             procedure.advance_phase()
         if (procedure.phase, procedure.trial_number) == before:
             return
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
         self._since = now
-        if procedure.phase == INTERVAL:
+        if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
 
     def time_to_next_tick(self, now: float) -> float:
@@ -180,13 +181,13 @@ class GuidedExperiment:
 
     @property
     def _is_interval_running(self) -> bool:
-        return self._procedure.phase == INTERVAL and self._driver is not None
+        return self._procedure.phase == INTERVAL_PHASE and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP and now - self._since >= _INTERVAL_PAUSE_S:
+        if self._procedure.phase == GAP_PHASE and now - self._since >= _INTERVAL_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:
@@ -208,10 +209,10 @@ class GuidedExperiment:
         result = self._apparatus.interval_result(
             self._procedure.current_level, self._stimulus, self._rows
         )
-        result = dataclasses.replace(result, lost_s=live.pace.given_up)
+        result = dataclasses.replace(result, lost_s=live.pace.lost_time_s)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
-        self._prepare_if_changed(now)
+        self._prepare_interval_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
         inner = self._live.frame()
@@ -225,7 +226,7 @@ class GuidedExperiment:
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
-            **_BLANK_VALUES,
+            **_BLANK_FRAME_VALUES,
             "f": [rendered] * 3,
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,

@@ -8,24 +8,23 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.live.experiment.design import ContactDetection, Experiment, PegInSlot, Task
-from drake_teleop.live.experiment.psychometrics import Psi
-from drake_teleop.live.experiment.store import Store, TrialRow
+from drake_teleop.live.experiment.psychometrics import PsiMethod
+from drake_teleop.live.experiment.store import TrialRow, TrialStore
 
-#: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
-CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
-    *("consent", "task", "ready", "interval", "gap", "answer"),
-    *("told", "break", "end"),
-)
+#: Phases of an experiment; `go` ends each one except gap, interval and answer.
+CONSENT_PHASE, TASK_PHASE, READY_PHASE = "consent", "task", "ready"
+INTERVAL_PHASE, GAP_PHASE, ANSWER_PHASE = "interval", "gap", "answer"
+FEEDBACK_PHASE, BREAK_PHASE, END_PHASE = "told", "break", "end"
 
 
 @dataclass(frozen=True)
-class Trial:
-    """Planned trial; `signal` is the interval with the stimulus, 1 or 2, or 0 for the peg task."""
+class PlannedTrial:
+    """Planned trial; `signal_interval` (1 or 2) has the stimulus; 0 for the peg task."""
 
     task: int
     condition: int
     practice: bool
-    signal: int
+    signal_interval: int
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class IntervalResult:
     lost_s: float = 0.0
 
 
-def plan_trials(experiment: Experiment, participant: int) -> list[Trial]:
+def plan_trials(experiment: Experiment, participant: int) -> list[PlannedTrial]:
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -61,7 +60,7 @@ def plan_trials(experiment: Experiment, participant: int) -> list[Trial]:
         for condition, is_practice in order:
             signal = int(rng.integers(1, 3))
             signal = 0 if isinstance(task, PegInSlot) else signal
-            trials.append(Trial(index, condition, is_practice, signal))
+            trials.append(PlannedTrial(index, condition, is_practice, signal))
     return trials
 
 
@@ -71,16 +70,16 @@ class Procedure:
     Attributes:
         level: intended level of the trial's stimulus [N or kg].
         prepared_intervals: number of intervals, also repeated ones.
-        said: whether the last answer was right.
-        again: whether the trial is repeated because the tool made no contact.
+        is_answer_right: whether the last answer was right.
+        is_repeated: whether the trial is repeated because the tool made no contact.
     """
 
-    def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
+    def __init__(self, experiment: Experiment, participant: int, store: TrialStore) -> None:
         self.experiment, self.participant, self._store = experiment, participant, store
         self.trials = plan_trials(experiment, participant)
         self._rows = store.read_rows(participant)
         self._psi = {
-            (t, c): Psi(task.low, task.high)
+            (t, c): PsiMethod(task.low, task.high)
             for t, task in enumerate(experiment.tasks)
             if not isinstance(task, PegInSlot)
             for c in range(len(experiment.conditions))
@@ -88,7 +87,7 @@ class Procedure:
         self._pressed: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._update_estimates(trial, row)
-        self.phase, self.said, self.again = CONSENT, False, False
+        self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
         self.prepared_intervals = 0
         self._prepare_trial()
 
@@ -97,7 +96,7 @@ class Procedure:
         return len(self._rows)
 
     @property
-    def trial(self) -> Trial:
+    def trial(self) -> PlannedTrial:
         return self.trials[min(self.trial_number, len(self.trials) - 1)]
 
     @property
@@ -107,7 +106,7 @@ class Procedure:
     @property
     def current_level(self) -> float:
         """Stimulus level of the present interval [N or kg]; 0 without stimulus."""
-        return self.level if self.trial.signal == self.interval else 0.0
+        return self.level if self.trial.signal_interval == self.interval else 0.0
 
     @property
     def expected_force(self) -> float:
@@ -126,13 +125,13 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def advance_phase(self) -> None:
-        if self.phase == CONSENT:
-            self.phase = END if self.trial_number >= len(self.trials) else TASK
-        elif self.phase in (TASK, BREAK):
-            self.phase = READY
-        elif self.phase == READY:
-            self.phase, self.again = INTERVAL, False
-        elif self.phase == FEEDBACK:
+        if self.phase == CONSENT_PHASE:
+            self.phase = END_PHASE if self.trial_number >= len(self.trials) else TASK_PHASE
+        elif self.phase in (TASK_PHASE, BREAK_PHASE):
+            self.phase = READY_PHASE
+        elif self.phase == READY_PHASE:
+            self.phase, self.is_repeated = INTERVAL_PHASE, False
+        elif self.phase == FEEDBACK_PHASE:
             self._start_next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
@@ -140,27 +139,27 @@ class Procedure:
         self._results[self.interval - 1] = result
         if not result.valid:
             self._prepare_trial()
-            self.phase, self.again = READY, True
-        elif self.trial.signal == 0:
+            self.phase, self.is_repeated = READY_PHASE, True
+        elif self.trial.signal_interval == 0:
             self._finish_trial(0, result.done, result.time_s)
         elif self.interval == 1:
-            self.interval, self.phase = 2, GAP
+            self.interval, self.phase = 2, GAP_PHASE
             self.prepared_intervals += 1
         else:
-            self.phase = ANSWER
+            self.phase = ANSWER_PHASE
 
     def start_second_interval(self) -> None:
-        self.phase = INTERVAL
+        self.phase = INTERVAL_PHASE
 
     def restart_trial(self) -> None:
-        if self.phase in (INTERVAL, GAP, ANSWER):
+        if self.phase in (INTERVAL_PHASE, GAP_PHASE, ANSWER_PHASE):
             self._prepare_trial()
-            self.phase = READY
+            self.phase = READY_PHASE
 
     def store_answer(self, interval: int, time_s: float) -> None:
         """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
-        if self.phase == ANSWER:
-            self._finish_trial(interval, interval == self.trial.signal, time_s)
+        if self.phase == ANSWER_PHASE:
+            self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
@@ -170,7 +169,7 @@ class Procedure:
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
             level=max(f.level for f in results),
-            signal=trial.signal,
+            signal=trial.signal_interval,
             answer=answer,
             correct=int(correct),
             time_s=round(time_s, 4),
@@ -180,13 +179,13 @@ class Procedure:
         self._store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
         self._update_estimates(trial, row)
-        self.said = bool(correct)
+        self.is_answer_right = bool(correct)
         if trial.practice:
-            self.phase = FEEDBACK
+            self.phase = FEEDBACK_PHASE
         else:
             self._start_next_trial()
 
-    def _update_estimates(self, trial: Trial, row: TrialRow) -> None:
+    def _update_estimates(self, trial: PlannedTrial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
@@ -197,21 +196,20 @@ class Procedure:
     def _start_next_trial(self) -> None:
         before = self.trials[self.trial_number - 1]
         if self.trial_number == len(self.trials):
-            self.phase = END
+            self.phase = END_PHASE
             return
         self._prepare_trial()
         practised = before.practice and not self.trial.practice
         if self.trial.task != before.task:
-            self.phase = TASK
+            self.phase = TASK_PHASE
         elif practised or self.trial_number % self.experiment.break_after == 0:
-            self.phase = BREAK
+            self.phase = BREAK_PHASE
         else:
-            self.phase = READY
+            self.phase = READY_PHASE
 
     def page_state(self) -> dict[str, Any]:
-        number = self.trial_number - (
-            self.phase == FEEDBACK
-        )  # FEEDBACK belongs to the finished trial
+        # FEEDBACK_PHASE belongs to the finished trial.
+        number = self.trial_number - (self.phase == FEEDBACK_PHASE)
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
@@ -221,7 +219,7 @@ class Procedure:
             "trials": len(self.trials),
             "practice": trial.practice,
             "interval": self.interval,
-            "again": self.again,
-            "said": self.said if self.phase == FEEDBACK else None,
-            "consent": self.experiment.consent if self.phase == CONSENT else "",
+            "again": self.is_repeated,
+            "said": self.is_answer_right if self.phase == FEEDBACK_PHASE else None,
+            "consent": self.experiment.consent if self.phase == CONSENT_PHASE else "",
         }

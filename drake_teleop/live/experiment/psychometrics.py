@@ -11,17 +11,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, xlogy
 
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 #: Grid of the uniform prior; thresholds and slopes are uniform in the logarithm.
-_NUM_THRESHOLDS = 81
-_SLOPES = np.geomspace(0.7, 3.0, 7)
-_LAPSE_RATES = np.array([0.0, 0.02, 0.04, 0.08])
+_NUM_GRID_THRESHOLDS = 81
+_GRID_SLOPES = np.geomspace(0.7, 3.0, 7)
+_GRID_LAPSE_RATES = np.array([0.0, 0.02, 0.04, 0.08])
 # Factor of the range of thresholds beyond the range of levels.
-_RANGE_FACTOR = 2.0
+_THRESHOLD_RANGE_FACTOR = 2.0
 _NUM_LEVELS = 25
 
 
@@ -31,7 +30,7 @@ def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Arr
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
-class Estimate(NamedTuple):
+class IntervalEstimate(NamedTuple):
     """Estimate with the limits of its 95 % interval."""
 
     value: float
@@ -39,29 +38,33 @@ class Estimate(NamedTuple):
     high: float
 
 
-class Psi:
+class PsiMethod:
     """Psi method: posterior of threshold, slope and lapse, for levels `low` > 0 to `high`."""
 
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _NUM_LEVELS)
-        self._thresholds = np.geomspace(low / _RANGE_FACTOR, high * _RANGE_FACTOR, _NUM_THRESHOLDS)
-        self._grid = tuple(
-            np.meshgrid(self._thresholds, _SLOPES, _LAPSE_RATES, indexing="ij", sparse=True)
+        self._thresholds = np.geomspace(
+            low / _THRESHOLD_RANGE_FACTOR, high * _THRESHOLD_RANGE_FACTOR, _NUM_GRID_THRESHOLDS
         )
-        shape = (_NUM_THRESHOLDS, len(_SLOPES), len(_LAPSE_RATES))
+        self._grid = tuple(
+            np.meshgrid(
+                self._thresholds, _GRID_SLOPES, _GRID_LAPSE_RATES, indexing="ij", sparse=True
+            )
+        )
+        shape = (_NUM_GRID_THRESHOLDS, len(_GRID_SLOPES), len(_GRID_LAPSE_RATES))
         self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
         self._p_correct = np.stack(
             [self._correct_probability(x).reshape(shape) for x in self.levels]
         )
-        self._p_correct = self._p_correct.reshape(_NUM_LEVELS, _NUM_THRESHOLDS, -1)
+        self._p_correct = self._p_correct.reshape(_NUM_LEVELS, _NUM_GRID_THRESHOLDS, -1)
 
     def _correct_probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
         """Return the level whose answer minimises the expected entropy of the threshold."""
-        posterior = self._posterior.reshape(_NUM_THRESHOLDS, -1)
+        posterior = self._posterior.reshape(_NUM_GRID_THRESHOLDS, -1)
         right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
         wrong = posterior.sum(axis=1) - right
         lost = np.zeros(_NUM_LEVELS)
@@ -76,20 +79,20 @@ class Psi:
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 
-    def threshold(self) -> Estimate:
+    def threshold(self) -> IntervalEstimate:
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
-        edges = math.log(self._thresholds[0]) + step * (np.arange(_NUM_THRESHOLDS + 1) - 0.5)
+        edges = math.log(self._thresholds[0]) + step * (np.arange(_NUM_GRID_THRESHOLDS + 1) - 0.5)
         below = np.concatenate([[0.0], np.cumsum(share)])
         value, low, high = np.exp(np.interp([0.5, 0.025, 0.975], below, edges))
-        return Estimate(float(value), float(low), float(high))
+        return IntervalEstimate(float(value), float(low), float(high))
 
-    def estimate_d_prime(self, level: float) -> Estimate:
+    def estimate_d_prime(self, level: float) -> IntervalEstimate:
         """Return the estimated sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)
         below = np.cumsum(share[order]) - 0.5 * share[order]
         found = np.interp([0.5, 0.025, 0.975], below, values[order])
-        return Estimate(*(float(x) for x in found))
+        return IntervalEstimate(*(float(x) for x in found))

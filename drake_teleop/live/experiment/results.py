@@ -12,24 +12,24 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
-from drake_teleop.live.experiment.psychometrics import Estimate, Psi
-from drake_teleop.live.experiment.store import Store, TrialRow
+from drake_teleop.live.experiment.psychometrics import IntervalEstimate, PsiMethod
+from drake_teleop.live.experiment.store import TrialRow, TrialStore, table_schema
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-_NORMAL_QUANTILE = 1.959964
-_PICTURED_QUANTITIES = (
+_NORMAL_QUANTILE_975 = 1.959964
+_DRAWN_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_DONE_SHARE_NAME = "share of trials done"
+_DONE_SHARE_QUANTITY = "share of trials done"
 
 
-class Result(NamedTuple):
+class ResultRow(NamedTuple):
     """Row of the result table: a quantity with its 95 % interval. Participant 0 is the mean."""
 
     task: str
@@ -42,41 +42,41 @@ class Result(NamedTuple):
     high: float
 
 
-def compute_results(experiment: Experiment, store: Store) -> list[Result]:
+def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow]:
     found = []
     numbers = store.participant_numbers()
     known = {n: [row for row in store.read_rows(n) if not row.practice] for n in numbers}
     for task in experiment.tasks:
         kind = type(task).__name__
         for condition in experiment.conditions:
-            each: dict[str, list[Result]] = {}
+            each: dict[str, list[ResultRow]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
                 for quantity, estimate in _participant_estimates(task, done).items():
-                    result = Result(kind, condition.name, n, len(done), quantity, *estimate)
+                    result = ResultRow(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
                     over = _mean_with_interval(
-                        [r.value for r in one], share=quantity == _DONE_SHARE_NAME
+                        [r.value for r in one], share=quantity == _DONE_SHARE_QUANTITY
                     )
                     trials = sum(r.trials for r in one)
-                    found.append(Result(kind, condition.name, 0, trials, quantity, *over))
+                    found.append(ResultRow(kind, condition.name, 0, trials, quantity, *over))
     return found
 
 
-def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Estimate]:
+def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, IntervalEstimate]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_DONE_SHARE_NAME: _wilson_interval(len(done), len(rows))}
+        found = {_DONE_SHARE_QUANTITY: _wilson_interval(len(done), len(rows))}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
         return found
-    psi = Psi(task.low, task.high)
+    psi = PsiMethod(task.low, task.high)
     for row in rows:
         psi.update(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
@@ -86,48 +86,42 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
-def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> IntervalEstimate:
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
         half = float(stdtrit(len(x) - 1, 0.975) * x.std(ddof=1) / math.sqrt(len(x)))
     found = (mean, mean - half, mean + half)
     if share:
-        return Estimate(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
-    return Estimate(*(math.exp(v) for v in found))
+        return IntervalEstimate(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
+    return IntervalEstimate(*(math.exp(v) for v in found))
 
 
-def _wilson_interval(successes: int, n: int) -> Estimate:
-    p, z2 = successes / n, _NORMAL_QUANTILE**2
+def _wilson_interval(successes: int, n: int) -> IntervalEstimate:
+    p, z2 = successes / n, _NORMAL_QUANTILE_975**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _NORMAL_QUANTILE / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return Estimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
+    half = _NORMAL_QUANTILE_975 / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return IntervalEstimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 
-def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
+def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:
     import polars as pl
 
     found = compute_results(experiment, store)
-    schema: dict[str, type[pl.DataType]] = {
-        name: pl.String for name in ("task", "condition", "quantity")
-    }
-    schema |= {name: pl.Int64 for name in ("participant", "trials")}
-    schema |= {name: pl.Float64 for name in ("value", "low", "high")}
-    schema = {name: schema[name] for name in Result._fields}
-    table = pl.DataFrame(found, schema=schema, orient="row").with_columns(
+    table = pl.DataFrame(found, schema=table_schema(ResultRow), orient="row").with_columns(
         pl.col("value", "low", "high").fill_nan(None)
     )
-    write_table(store.folder / "trials.csv", store.results_table())
+    write_table(store.folder / "trials.csv", store.trials_table())
     write_table(store.folder / "results.csv", table)
     _write_picture(store.folder / "results.png", experiment, found)
     return table
 
 
-def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
+def _write_picture(path: Path, experiment: Experiment, found: list[ResultRow]) -> None:
     from drake_teleop.common.style import Picture, plot_style
 
     shown = [
-        quantity for quantity in _PICTURED_QUANTITIES if any(r.quantity == quantity for r in found)
+        quantity for quantity in _DRAWN_QUANTITIES if any(r.quantity == quantity for r in found)
     ]
     if not shown:
         return
@@ -146,7 +140,7 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
     write_picture(path, figure, bbox_inches="tight")
 
 
-def _draw_results(axes: Axes, names: list[str], found: list[Result]) -> None:
+def _draw_results(axes: Axes, names: list[str], found: list[ResultRow]) -> None:
     from matplotlib.ticker import LogLocator
 
     from drake_teleop.common.style import BLUE, VERMILION

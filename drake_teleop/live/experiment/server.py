@@ -13,10 +13,10 @@ from drake_teleop.live.experiment.design import Experiment
 from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.simulated import make_all_apparatus
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
-from drake_teleop.live.server import LiveDrive, start_condition, warm_up
+from drake_teleop.live.server import LiveDrive, compile_session_functions, start_condition_text
 from drake_teleop.station.scenario import Scenario
 
 
@@ -27,7 +27,7 @@ class ExperimentDrive(LiveDrive):
         self,
         experiment: Experiment,
         scenarios: list[Scenario],
-        store: Store,
+        store: TrialStore,
         participant: int,
         port: int = 0,
         device: str | None = None,
@@ -35,7 +35,7 @@ class ExperimentDrive(LiveDrive):
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
         self._stations = make_all_apparatus(experiment, scenarios)
-        self._procedure = Procedure(experiment, participant, store)
+        self.procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
 
@@ -44,17 +44,13 @@ class ExperimentDrive(LiveDrive):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
         first = self._stations[0, 0]
-        warm_up(first.scenario, first.load, device)
+        compile_session_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
-        shows = [view.show for view in self._views.values()]
-        setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
+        shows = [view.frame_part for view in self._views.values()]
+        setup = (self.procedure, self._stations, self._scenarios, self._store, shows)
         return GuidedExperiment(*setup, time.perf_counter(), link)
-
-    def count_done_trials(self) -> tuple[int, int]:
-        """Return the numbers of finished trials and of all trials."""
-        return self._procedure.trial_number, len(self._procedure.trials)
 
     def _page_html(self) -> str:
         panel = (
@@ -66,7 +62,7 @@ class ExperimentDrive(LiveDrive):
 def serve_experiment(
     experiment: Experiment,
     scenarios: list[Scenario],
-    store: Store,
+    store: TrialStore,
     participant: int,
     *,
     port: int,
@@ -78,10 +74,11 @@ def serve_experiment(
     if browser:
         webbrowser.open(live.url)
     print(
-        f"participant {participant} at {live.url}\n{start_condition(device)}; Ctrl-C ends it",
+        f"participant {participant} at {live.url}\n{start_condition_text(device)}; Ctrl-C ends it",
         flush=True,
     )
-    reason, (done, trials) = live.wait_for_signal(), live.count_done_trials()
+    reason = live.wait_for_signal()
+    done, trials = live.procedure.trial_number, len(live.procedure.trials)
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(

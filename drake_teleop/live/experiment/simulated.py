@@ -20,14 +20,14 @@ from drake_teleop.live.experiment.design import (
     SimulatedParticipant,
 )
 from drake_teleop.live.experiment.procedure import (
-    ANSWER,
-    END,
-    GAP,
-    INTERVAL,
+    ANSWER_PHASE,
+    END_PHASE,
+    GAP_PHASE,
+    INTERVAL_PHASE,
     IntervalResult,
     Procedure,
 )
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.inputs import LENGTH_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
@@ -63,15 +63,15 @@ def simulate_participant(
     experiment: Experiment,
     scenarios: list[Scenario],
     stations: dict[tuple[int, int], Apparatus],
-    store: Store,
+    store: TrialStore,
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
     """Run the remaining trials; `progress` receives the numbers of finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
-    while procedure.phase != END:
-        if procedure.phase == INTERVAL:
+    while procedure.phase != END_PHASE:
+        if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
                 result = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
@@ -79,9 +79,9 @@ def simulate_participant(
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
             procedure.finish_interval(result)
-        elif procedure.phase == GAP:
+        elif procedure.phase == GAP_PHASE:
             procedure.start_second_interval()
-        elif procedure.phase == ANSWER:
+        elif procedure.phase == ANSWER_PHASE:
             rng = np.random.default_rng([experiment.seed, participant, procedure.trial_number, 3])
             procedure.store_answer(compare_responses(observer, responses, rng), 0.5)
             progress(procedure.trial_number, len(procedure.trials))
@@ -126,7 +126,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     session.close()
     return apparatus.interval_result(
         procedure.current_level, stimulus, rows
-    ), rows.largest_force_change(_MOTION_START_S)
+    ), rows.largest_rendered_force_change(_MOTION_START_S)
 
 
 def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import polars as pl
 
@@ -17,7 +18,7 @@ from drake_teleop.lab.studies.store import locked_folder
 from drake_teleop.live.experiment.design import Experiment
 
 #: Largest valid participant number.
-MAX_PARTICIPANT = 9999
+MAX_PARTICIPANT_NUMBER = 9999
 
 
 @dataclass(frozen=True)
@@ -46,14 +47,17 @@ class TrialRow:
     lost_s: float
 
 
-_TRIAL_SCHEMA: dict[str, type[pl.DataType]] = {
-    field.name: {"int": pl.Int64, "float": pl.Float64, "str": pl.String}[str(field.type)]
-    for field in dataclasses.fields(TrialRow)
-}
+def table_schema(row: type) -> dict[str, type[pl.DataType]]:
+    """Return the column types of a table whose rows have the annotated fields of a class."""
+    types: dict[type, type[pl.DataType]] = {int: pl.Int64, float: pl.Float64, str: pl.String}
+    return {name: types[kind] for name, kind in get_type_hints(row).items()}
+
+
+_TRIAL_SCHEMA = table_schema(TrialRow)
 
 
 @dataclass(frozen=True)
-class Store:
+class TrialStore:
     """Trials of an experiment on disk, in one folder."""
 
     folder: Path
@@ -85,7 +89,7 @@ class Store:
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_TRIAL_SCHEMA)
         write_table(self.participant_file(participant), table)
 
-    def results_table(self) -> pl.DataFrame:
+    def trials_table(self) -> pl.DataFrame:
         rows = [
             {"participant": n} | dataclasses.asdict(row)
             for n in self.participant_numbers()
@@ -95,9 +99,9 @@ class Store:
 
 
 @contextmanager
-def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[Store]:
+def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[TrialStore]:
     """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
     with locked_folder(folder, identity):
-        yield Store(folder)
+        yield TrialStore(folder)

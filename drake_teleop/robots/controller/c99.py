@@ -19,7 +19,7 @@ from drake_teleop.logs.causal import design_low_pass
 from drake_teleop.robots import compensation_step as step
 from drake_teleop.robots.compensator import STALE_AGE_S, Compensator
 from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
-from drake_teleop.robots.streams import NUM_VALUES, Reading
+from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
@@ -28,10 +28,6 @@ KERNEL_FILES = ("wrench_compensator.h", "wrench_compensator.c", "load.h")
 _TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_AMPLITUDES = np.repeat([1.0, 0.05], 3)
-_SETTING_NAMES = (
-    *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
-    *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
-)  # in the order of the C structure
 
 Files = Mapping[str, str | bytes]
 
@@ -39,13 +35,17 @@ Files = Mapping[str, str | bytes]
 @cache
 def c_kernel_text() -> str:
     c = Translator()
-    values, row, out = (NUM_VALUES,), (NUM_VALUES + 6,), (12,)
-    c.translate_function(step.value_problem, values=values, largest=values, limits=(6,))
+    values, row, out = (NUM_READING_VALUES,), (NUM_READING_VALUES + 6,), (12,)
+    c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
     c.translate_function(
-        step.scales_into, sigma_weight="double", sigma_inertia="double", gamma="double", scales=(4,)
+        step.set_scale_factors_into,
+        sigma_weight="double",
+        sigma_inertia="double",
+        gamma="double",
+        scales=(4,),
     )
     c.translate_function(
-        step.eliminate_into,
+        step.contact_and_scaled_wrench_into,
         values=values,
         gravity=(3,),
         offsets=(6,),
@@ -61,7 +61,12 @@ def c_kernel_text() -> str:
     c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
     c.translate_function(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
     c.translate_function(
-        step.tare_into, count="double", mean=row, squares=row, noise_limits=(6,), offsets=(6,)
+        step.update_tare_offsets,
+        count="double",
+        mean=row,
+        squares=row,
+        noise_limits=(6,),
+        offsets=(6,),
     )
     c.translate_function(
         design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,)
@@ -69,11 +74,7 @@ def c_kernel_text() -> str:
     return render_template("wrench_compensator.c", kernel=c.text, helpers=C_HELPER_FUNCTIONS)
 
 
-def c_header_text() -> str:
-    return read_template("wrench_compensator.h")
-
-
-class Target(NamedTuple):
+class ControllerTarget(NamedTuple):
     """Load, rate, low-pass and sensor of an export.
 
     Attributes:
@@ -82,31 +83,26 @@ class Target(NamedTuple):
         notes: warnings for the user.
     """
 
-    found: Identification
+    load: Identification
     dt: float
     cutoff_hz: float | None
-    largest: Array | None
+    sensor_range: Array | None
     sign: int
     notes: list[str]
 
     def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
-        """Return the C initializer of a `wrench_compensator_settings`."""
-        loop = self.make_compensator(largest, **scales)
-        values = {
-            "sigma_weight": 0.0,
-            "sigma_inertia": 0.0,
-            "gamma": 1.0,
-            **scales,
-            **loop.settings,
-        }
-        return "".join(f"    {_c_literal(values[name])}, /* {name} */\n" for name in _SETTING_NAMES)
+        """Return the C initializer of `wrench_compensator_settings`, in the order of its fields."""
+        others = self.make_compensator(largest, **scales).c_settings
+        values = {name: others.pop(name) for name in ("phi", "offsets")}
+        values |= {"sigma_weight": 0.0, "sigma_inertia": 0.0, "gamma": 1.0, **scales, **others}
+        return "".join(f"    {_c_literal(each)}, /* {name} */\n" for name, each in values.items())
 
     def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
-        largest = self.largest if largest is None else largest
-        return Compensator(self.found, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
+        largest = self.sensor_range if largest is None else largest
+        return Compensator(self.load, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
 
 
-def c99_files(target: Target) -> Files:
+def c99_files(target: ControllerTarget) -> Files:
     return {
         **kernel_files(target),
         "test_vector.h": _test_vector_header(target),
@@ -122,11 +118,17 @@ def c99_files(target: Target) -> Files:
     }
 
 
-def kernel_files(target: Target) -> Files:
+def kernel_files(target: ControllerTarget) -> Files:
     load = render_template(
         "load.h", dt=repr(target.dt), settings=target.settings_initializer(), notes=target.notes
     )
-    return dict(zip(KERNEL_FILES, (c_header_text(), c_kernel_text(), load), strict=True))
+    return dict(
+        zip(
+            KERNEL_FILES,
+            (read_template("wrench_compensator.h"), c_kernel_text(), load),
+            strict=True,
+        )
+    )
 
 
 def read_template(name: str) -> str:
@@ -136,20 +138,24 @@ def read_template(name: str) -> str:
 def render_template(name: str, **values: Any) -> str:
     """Return a shipped template with inserted values; nothing is escaped."""
 
-    def plain(value: Any) -> Any:
+    def keep_unescaped(value: Any) -> Any:
         if isinstance(value, str):
             return Markup(value)
-        return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
+        return (
+            [keep_unescaped(each) for each in value] if isinstance(value, (list, tuple)) else value
+        )
 
-    values = {key: plain(value) for key, value in ({"version": __version__} | values).items()}
+    values = {
+        key: keep_unescaped(value) for key, value in ({"version": __version__} | values).items()
+    }
     return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
-def _test_vector_header(target: Target) -> str:
+def _test_vector_header(target: ControllerTarget) -> str:
     inputs, largest = _simulated_readings(target)
     python = target.make_compensator(largest, **_TEST_SCALES)
     outputs = [
-        python.step(Reading(k, t, row[:NUM_VALUES], gravity=row[NUM_VALUES:]), t)
+        python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
@@ -161,7 +167,7 @@ def _test_vector_header(target: Target) -> str:
     )
 
 
-def _simulated_readings(target: Target) -> tuple[Array, Array]:
+def _simulated_readings(target: ControllerTarget) -> tuple[Array, Array]:
     """Return rows [wrench, s, omega, alpha, gravity] (N, 18) and a sensor range (6,)."""
     phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
@@ -169,7 +175,7 @@ def _simulated_readings(target: Target) -> tuple[Array, Array]:
     down = np.array([3.0, -4.0, -8.0]) + omega
     motion = 5.0 * alpha - down, omega, alpha
     contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_AMPLITUDES
-    wrench = non_contact_wrench(*motion, target.found.phi) + target.found.offsets + contact
+    wrench = non_contact_wrench(*motion, target.load.phi) + target.load.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
     largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
     readings[100:103, 7], readings[200, 0], readings[201, 12] = np.nan, np.inf, 1e7

@@ -11,12 +11,41 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.robots.controller.c99 import Files, Target, c99_files
+from drake_teleop.robots.controller.c99 import (
+    ControllerTarget,
+    Files,
+    c99_files,
+    kernel_files,
+    read_template,
+    render_template,
+)
 from drake_teleop.robots.controller.fmu import fmu_files
-from drake_teleop.robots.controller.ros2_filter import ros2_filter_files
-from drake_teleop.robots.export import refuse_removed_weight, sensor_frame_error
+from drake_teleop.robots.export import refuse_removed_weight, unused_sensor_pose_error
 
-FORMATS: dict[str, Callable[[Target], Files]] = {
+_FILTER_NAME = "wrench_compensator_filter"
+_TEMPLATE_FOLDER = "ros2_filter"
+
+
+def ros2_filter_files(target: ControllerTarget) -> Files:
+    """Return the files of a ROS 2 package with a filter of wrenches."""
+    shipped = {
+        f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
+        "package.xml": "package.xml",
+        "CMakeLists.txt": "CMakeLists.txt",
+        f"src/{_FILTER_NAME}.cpp": f"{_FILTER_NAME}.cpp",
+    }
+    kernel = dict(kernel_files(target))
+    sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
+    kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
+    values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
+    return {
+        **{name: read_template(f"{_TEMPLATE_FOLDER}/{file}") for name, file in shipped.items()},
+        **{f"src/{name}": text for name, text in kernel.items()},
+        "README.md": render_template(f"{_TEMPLATE_FOLDER}/README.md", **values),
+    }
+
+
+CONTROLLER_FORMATS: dict[str, Callable[[ControllerTarget], Files]] = {
     "c99": c99_files,
     "fmu": fmu_files,
     "ros2_filter": ros2_filter_files,
@@ -44,7 +73,7 @@ def export_controller(
             f"missing, but required by {to}", where="rate", remedy="give the readings' rate in Hz"
         )
     if sensor_pose is not None:
-        raise sensor_frame_error(to)
+        raise unused_sensor_pose_error(to)
     refuse_removed_weight(found, to)
     notes = [
         f"{name} is that of a point mass: it is not identified" for name in usable_phi(found)[1]
@@ -52,7 +81,9 @@ def export_controller(
     if largest is None:
         notes.append("no range of the sensor was given: saturation is not detected")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)
-    files = FORMATS[to](Target(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes))
+    files = CONTROLLER_FORMATS[to](
+        ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
+    )
     for name, content in files.items():
         path = out / name
         make_folder(path.parent)

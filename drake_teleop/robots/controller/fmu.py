@@ -13,7 +13,13 @@ from uuid import NAMESPACE_URL, uuid5
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from drake_teleop.common.version import __version__
-from drake_teleop.robots.controller.c99 import CFLAGS, Files, Target, kernel_files, read_template
+from drake_teleop.robots.controller.c99 import (
+    CFLAGS,
+    ControllerTarget,
+    Files,
+    kernel_files,
+    read_template,
+)
 
 _MODEL_NAME = "wrench_compensator"
 _WRENCH_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
@@ -30,7 +36,7 @@ _UNIT_EXPONENTS = {
 _PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
-def fmu_files(target: Target) -> Files:
+def fmu_files(target: ControllerTarget) -> Files:
     """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
     compiler = shutil.which("cc")
     if platform.system() != "Linux" or platform.machine() != "x86_64":
@@ -47,7 +53,9 @@ def fmu_files(target: Target) -> Files:
     }
 
 
-def _fmu_archive(target: Target, kernel: Files, version: str, token: str, cc: str | None) -> bytes:
+def _fmu_archive(
+    target: ControllerTarget, kernel: Files, version: str, token: str, cc: str | None
+) -> bytes:
     sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     compiled = [name for name in sources if name.endswith(".c")]
@@ -58,7 +66,7 @@ def _fmu_archive(target: Target, kernel: Files, version: str, token: str, cc: st
         group = SubElement(configuration, "SourceFileSet", language="C99")
         for name in compiled:
             SubElement(group, "SourceFile", name=name)
-        files["sources/buildDescription.xml"] = _xml_text(build)
+        files["sources/buildDescription.xml"] = _indented_xml(build)
     if cc is not None:
         binary = f"binaries/{_PLATFORMS[version]}/{_MODEL_NAME}.so"
         files[binary] = _compile_library(cc, sources, compiled)
@@ -80,7 +88,9 @@ def _compile_library(compiler: str, sources: Files, compiled: list[str]) -> byte
         return (folder / "library.so").read_bytes()
 
 
-def _model_description(target: Target, version: str, token: str, compiled: list[str]) -> str:
+def _model_description(
+    target: ControllerTarget, version: str, token: str, compiled: list[str]
+) -> str:
     new = version == "3.0"
     root = Element(
         "fmiModelDescription",
@@ -121,7 +131,7 @@ def _model_description(target: Target, version: str, token: str, compiled: list[
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
     structure = SubElement(root, "ModelStructure")
     _add_unknowns(structure, outputs, new)
-    return _xml_text(root)
+    return _indented_xml(root)
 
 
 def _add_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
@@ -134,11 +144,11 @@ def _add_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
                 SubElement(group, "Unknown", index=str(k + 1))
 
 
-def _model_variables(target: Target) -> list[tuple[str, str, str, float | None]]:
+def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
-    found = target.make_compensator().settings
+    found = target.make_compensator().c_settings
     phi_units = ["kg", *["kg.m"] * 3, *["kg.m2"] * 6]
     phi_names = ("m", "mc_x", "mc_y", "mc_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
     phi = zip(phi_names, phi_units, found["phi"], strict=True)
@@ -156,6 +166,6 @@ def _model_variables(target: Target) -> list[tuple[str, str, str, float | None]]
     ]
 
 
-def _xml_text(root: Element) -> str:
+def _indented_xml(root: Element) -> str:
     indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"

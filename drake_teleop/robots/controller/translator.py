@@ -63,7 +63,7 @@ class Translator:
     """Translator of numba functions to C; called functions come first."""
 
     def __init__(self) -> None:
-        self._functions: dict[tuple[Any, ...], _Function] = {}
+        self._functions: dict[tuple[Any, ...], _FunctionTranslation] = {}
 
     @property
     def text(self) -> str:
@@ -71,7 +71,7 @@ class Translator:
 
     def translate_function(
         self, function: Any, **parameters: str | tuple[int | str, ...]
-    ) -> _Function:
+    ) -> _FunctionTranslation:
         """Translate a numba function to C.
 
         `parameters` are its types in order: "double", "int" or the shape of an array, whose first
@@ -81,12 +81,12 @@ class Translator:
         if key not in self._functions:
             uses = sum(known[0] is function for known in self._functions)
             name = function.py_func.__name__ + (f"_{uses + 1}" if uses else "")
-            made = _Function(self, function.py_func, name, parameters)
+            made = _FunctionTranslation(self, function.py_func, name, parameters)
             self._functions[key] = made
         return self._functions[key]
 
 
-class _Function:
+class _FunctionTranslation:
     def __init__(
         self, translator: Translator, function: Any, name: str, parameters: dict[str, Any]
     ) -> None:
