@@ -18,7 +18,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,
     estimate_from_poses,
-    motion_of_load,
+    fit_motion_to_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pass, remove_delay
@@ -51,11 +51,11 @@ def motion_of_known_load(
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
 
     def motion_at_delay(late: float | None) -> PoseMotion:
-        return motion_of_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
+        return fit_motion_to_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
 
     with suppress(DrakeTeleopError):  # too short
         found, source = _fit_with_delay_or_usual(log, delay, motion_at_delay, usual_s, "load")
-        return (found, source) if found.imu_agrees else None
+        return (found, source) if found.is_imu_consistent else None
     return None
 
 
@@ -68,7 +68,7 @@ def _fit_with_delay_or_usual(
 ) -> tuple[_Motion, str]:
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
-    if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
+    if known is None and not found.delay_deviation_s < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
 
@@ -111,9 +111,9 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
 
 def clock_rate_notes(found: PoseMotion) -> list[str]:
     """Return a note if the clock rate of the poses differs from that of the wrench."""
-    if not found.clock_rate:
+    if not found.clock_rate_error:
         return []
-    side = "faster" if found.clock_rate > 0.0 else "slower"
+    side = "faster" if found.clock_rate_error > 0.0 else "slower"
     return [
         f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
         " that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"

@@ -64,8 +64,8 @@ def fit_posed(
     found, source = estimate_motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
-        rotated = found.frame.turned and not found.frame.shifted
-        if not found.imu_agrees or (finding is not None and not rotated):
+        rotated = found.frame.is_rotated and not found.frame.is_shifted
+        if not found.is_imu_consistent or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)

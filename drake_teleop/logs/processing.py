@@ -267,7 +267,7 @@ def _identify_read_log(
         findings,
         causes,
         loads,
-        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation,
+        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation_s,
     )
 
 
