@@ -86,7 +86,7 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
     return _ROOT_OF_2 / _prewarped_frequency(cutoff_hz, dt)
 
 
-def causal_wrenches(
+def compute_causal_wrench(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalWrench:
     """Return the filtered wrenches that a control loop has at each instant.

@@ -223,10 +223,10 @@ _CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], No
 }
 
 
-_MARGIN_IN_KNOTS = 2.0  # knots, at either end
+_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
 _MIN_ROWS = 100
-_MAX_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
-_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
+_MIN_WIDENING_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_BLOCK_MEAN_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
@@ -259,7 +259,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN_IN_KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _MARGIN_OVER_KNOT_SPACING * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
@@ -271,7 +271,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
-    f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
+    f = np.linspace(0.0, _BLOCK_MEAN_BANDWIDTH_HZ, 500)
     share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.remaining_noise_shares(f)[0]
@@ -301,7 +301,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)

@@ -26,14 +26,14 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
 
-BANDWIDTH_HZ = 30.0
+GAP_BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
 MIN_REPEATED_BLOCK_ROWS = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
-_WRENCH_NAMES = {"f_x", "tau_x"}
+_CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
 _QUANTITY_NAMES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
@@ -53,7 +53,10 @@ def inspect_command(
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect_described_log(load_description(log), str(log), {}, summary)
-    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _WRENCH_NAMES:
+    elif (
+        not (others or is_bag(log))
+        and (table := read_table(log)).columns.keys() >= _CANONICAL_WRENCH_COLUMNS
+    ):
         summary["kind"] = "canonical"
         _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -270,7 +273,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length(median, BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length(median, GAP_BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,

@@ -31,7 +31,7 @@ from drake_teleop.load.identification import VERDICT_NAMES, Identification, natu
 from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedLog
 from drake_teleop.logs.read.canonical import Log
 
-_CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
+_CHANNEL_SYMBOLS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
 _PARAMETER_SYMBOLS = (
     *(rf"$f_{{o{a}}}$" for a in "xyz"),
     *(rf"$\tau_{{o{a}}}$" for a in "xyz"),
@@ -63,7 +63,7 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
-        _draw_intervals_into(figure, found)
+        _draw_spectrum_and_intervals_into(figure, found)
     return figure
 
 
@@ -75,7 +75,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
         imsave(unfinished, np.concatenate([imread(upper), imread(lower)]), format="png")
 
 
-def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
+def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
     """Return frequencies (m,) [Hz] and one-sided amplitude spectral densities (m, k) of x (N, k).
 
     Welch's method. The densities are in unit of x / sqrt(Hz). Frequency 0 is omitted.
@@ -101,23 +101,25 @@ def _draw_fit_into(figure: Any, found: IdentifiedLog) -> None:
     for i, axis in enumerate(axes):
         _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
         unit = "N" if i < 3 else "N m"
-        axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
+        axis.set_title(f"{_CHANNEL_SYMBOLS[i]}: residual {rms[i]:.3g} {unit} rms")
         if not log.static:
             shade_contact(axis, log.t, found.rejected)
     _add_labels_and_title(figure, axes, title, log, result.delay_s)
 
 
-def _draw_intervals_into(figure: Any, found: IdentifiedLog) -> None:
+def _draw_spectrum_and_intervals_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     residual = log.wrench - found.predicted
     if log.static:
         rate, shown = 1.0 + np.arange(len(log)), residual
     else:
-        rate, shown = spectrum(residual, log.dt)
+        rate, shown = amplitude_spectral_densities(residual, log.dt)
     spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
     left, right = spectra.subplots(1, 2)
     for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-        curves = zip(_CHANNELS[columns], (BLUE, VERMILION, GREEN), shown[:, columns].T, strict=True)
+        curves = zip(
+            _CHANNEL_SYMBOLS[columns], (BLUE, VERMILION, GREEN), shown[:, columns].T, strict=True
+        )
         for name, colour, values in curves:
             if log.static:
                 axis.plot(rate, values, "o", color=colour, label=name)
@@ -131,10 +133,10 @@ def _draw_intervals_into(figure: Any, found: IdentifiedLog) -> None:
             top = axis.get_ylim()[1]
             axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
         axis.legend(ncols=3)
-    _draw_parameters(known, result)
+    _draw_parameter_intervals(known, result)
 
 
-def _draw_parameters(figure: Any, result: Identification) -> None:
+def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     natural = natural_scales(result.phi)
     theta = np.concatenate([result.offsets, result.phi]) / natural
     low, high = (end / natural for end in confidence_intervals(result))
@@ -201,7 +203,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         axes = _channel_axes(below)
         for i, axis in enumerate(axes):
             _draw_curves(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
-            axis.set_title(_CHANNELS[i])
+            axis.set_title(_CHANNEL_SYMBOLS[i])
             shade_contact(axis, t, touched)
         _add_labels_and_title(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
     return figure

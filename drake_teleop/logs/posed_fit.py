@@ -29,10 +29,13 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
-_MIN_NOISE_SHARE = 1e-9
-# Fewest kept samples, and their rate over the cut-off of the low-pass.
-_MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
-_CHUNK, _FILTER_NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
+_MIN_NOISE_OVER_WRENCH = 1e-9
+# Fewest kept samples, and largest cut-off of the low-pass over their rate.
+_MIN_KEPT_SAMPLES, _CUTOFF_OVER_KEPT_RATE = 400_000, 0.25
+_CHUNK_SAMPLES, _FILTER_NEIGHBOURS = (
+    2**14,
+    2**8,
+)  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
@@ -41,17 +44,17 @@ class PosedFit:
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
+        delay_source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
     log: Log
     fit: BatchResult
     delay_s: float
-    source: str
+    delay_source: str
     motion: PoseEstimate
 
 
-def fit_posed(
+def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
@@ -87,15 +90,18 @@ def fit_posed(
 def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
     stride = len(log) // _MIN_KEPT_SAMPLES
     if cutoff_hz is not None:
-        stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
+        stride = min(stride, int(_CUTOFF_OVER_KEPT_RATE / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
     few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
-    for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
-        before, stop = max(0, start - _FILTER_NEIGHBOURS), start + _CHUNK + _FILTER_NEIGHBOURS
+    for start in range(0, len(few), _CHUNK_SAMPLES):  # in chunks, to save memory
+        before, stop = (
+            max(0, start - _FILTER_NEIGHBOURS),
+            start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS,
+        )
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
-        wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
+        wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
     bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
 
@@ -108,7 +114,7 @@ def _batch_result_of_estimate(
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_SHARE * size + 1e-30))
+    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_OVER_WRENCH * size + 1e-30))
     equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()
