@@ -140,8 +140,8 @@ def eliminate_command(
     }
     if found.point_mass_inertias:
         summary["notes"].append(
-            f"{', '.join(found.point_mass_inertias)} of the load file are not identifiable: those of a point"
-            " mass are used"
+            f"{', '.join(found.point_mass_inertias)} of the load file are not identifiable: those"
+            " of a point mass are used"
         )
     if found.tare_fraction < 0.5:
         summary["notes"].append(

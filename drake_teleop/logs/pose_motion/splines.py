@@ -37,7 +37,7 @@ class ImuSplineRows:
         acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
         quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
         pose_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
-        own_powers: noise power densities of acceleration and angular velocity.
+        imu_powers: noise power densities of acceleration and angular velocity.
     """
 
     t: Array
