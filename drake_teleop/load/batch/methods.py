@@ -42,7 +42,7 @@ from drake_teleop.load.normal_equations import NormalEquations
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_RELATIVE_NOISE = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_NOISE_SHARE = 0.01
+_MIN_WRENCH_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -50,7 +50,7 @@ _STD_PER_NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
-_NOTE_NOTHING_REJECTED = (
+_NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " are indistinguishable from motion errors (delay, scale, mounting): no sample was rejected"
 )
@@ -112,7 +112,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
         moments = SecondMoments()
         moments.add(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_STD_GROWTH:
-            return replace(whole, note=_NOTE_NOTHING_REJECTED)
+            return replace(whole, note=_NOTHING_REJECTED_NOTE)
         fit = _fit_moments(moments, options, record)
         form = fit.form
         if (rejected == previous).all():
@@ -262,7 +262,7 @@ def _fit_moments(
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
             std = np.sqrt(
-                np.maximum(squares - explained, _MIN_NOISE_SHARE * squares).clip(floor**2)
+                np.maximum(squares - explained, _MIN_WRENCH_NOISE_SHARE * squares).clip(floor**2)
             )
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))

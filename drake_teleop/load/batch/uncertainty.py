@@ -37,7 +37,7 @@ _PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^
 # coefficient that is rounding.
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
-_NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
+_MIN_NUMBERED_TERM_SHARE, _MIN_ELLIPSIS_TERM_SHARE = 0.1, 0.01
 
 
 def confidence_intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
@@ -72,20 +72,20 @@ class Combination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading: index of the leading parameter in `PARAMETER_NAMES`.
-        share: standard deviation relative to the natural scale of the combination.
-        words: the sum as text.
+        relative_deviation: standard deviation relative to the natural scale of the combination.
+        text: the sum in words.
     """
 
     coefficients: Array
     leading: int
     value: float
     standard_deviation: float
-    share: float
-    words: str
+    relative_std: float
+    text: str
 
     def __str__(self) -> str:
         unit = _PARAMETER_UNITS[self.leading]
-        return f"{self.words} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
+        return f"{self.text} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +93,15 @@ class BaseParameters:
     """Combinations of load and offsets that a record determines (Gautier, Khalil, 1990).
 
     Attributes:
-        without_influence: names of parameters without influence on the wrench.
-        directions: combinations of the parameters that are not identified individually.
-        slow_noise: names of wrench channels with drift.
+        parameters_without_influence: names of parameters without influence on the wrench.
+        weak_directions: combinations of the parameters that are not identified individually.
+        channels_with_slow_noise: names of wrench channels with drift.
     """
 
     combinations: tuple[Combination, ...]
-    without_influence: tuple[str, ...]
-    directions: tuple[Combination, ...]
-    slow_noise: tuple[str, ...]
+    parameters_without_influence: tuple[str, ...]
+    weak_directions: tuple[Combination, ...]
+    channels_with_slow_noise: tuple[str, ...]
 
     @property
     def num_combinations(self) -> int:
@@ -109,20 +109,22 @@ class BaseParameters:
 
     def text_lines(self) -> list[str]:
         lines = [f"{self.num_combinations} of 16 combinations of offsets and load are determined"]
-        if self.without_influence:
-            names = ", ".join(self.without_influence)
+        if self.parameters_without_influence:
+            names = ", ".join(self.parameters_without_influence)
             lines.append(f"without influence on this record: {names}")
         lines += [
             f"only together: {c}" for c in self.combinations if np.count_nonzero(c.coefficients) > 1
         ]
-        for c in self.directions:
-            if np.count_nonzero(c.coefficients) == 1 or c.share > MAX_IDENTIFIED_DEVIATION:
-                percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
+        for c in self.weak_directions:
+            if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_DEVIATION:
+                percentage = (
+                    f"{100.0 * c.relative_std:.0f} % of" if c.relative_std < 1.0 else "more than"
+                )
                 lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
-        if self.slow_noise:
-            names = ", ".join(self.slow_noise)
+        if self.channels_with_slow_noise:
+            names = ", ".join(self.channels_with_slow_noise)
             lines.append(f"drift or slow noise in {names}: all +- are lower bounds")
         return lines
 
@@ -131,7 +133,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scales(load.phi)
-    unexcited = equations.unexcited_directions
+    unexcited = equations.unexcited_columns
 
     def scaled_combination(coefficients: Array, leading: int) -> Combination:
         c = coefficients / coefficients[leading]
@@ -178,12 +180,12 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
 def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = PARAMETER_NAMES[leading]
-    for i in np.flatnonzero(weights >= _NUMBER_SHARE):
+    for i in np.flatnonzero(weights >= _MIN_NUMBERED_TERM_SHARE):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETER_NAMES[i]}"
-    small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
+    small = (weights < _MIN_NUMBERED_TERM_SHARE) & (weights >= _MIN_ELLIPSIS_TERM_SHARE)
     return text + " + ..." if small.any() else text
 
 
@@ -279,7 +281,9 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
     products = (regressor_coefficients() @ Z)[:, :, 1:7]
-    effects = fit.form.transfer @ parameter_errors_by_gains(products[None], W[None], root @ root.T)
+    effects = fit.form.map_from_ordinary @ parameter_errors_by_gains(
+        products[None], W[None], root @ root.T
+    )
     return np.asarray(effects @ effects.T)
 
 
@@ -291,7 +295,7 @@ def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Arr
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
-    covariance = form.transfer @ covariance @ form.transfer.T
+    covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
     unknown = unknown | form.undetermined
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf

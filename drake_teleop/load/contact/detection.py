@@ -25,10 +25,10 @@ from drake_teleop.load.contact.noise_floor import (
     NUM_SUM_LENGTHS,
     DetectorSamples,
     NoiseFloor,
-    check_samples,
     hold_acceleration_peaks,
     noise_std_into,
     statistic_index,
+    validate_detector_samples,
     wrench_variance_by_parameters_into,
 )
 
@@ -132,7 +132,7 @@ def statistics_of_log(
     floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
 ) -> Array:
     """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
-    rows = check_samples(*samples)
+    rows = validate_detector_samples(*samples)
     out = np.empty((len(rows[0]), 3))
     sums = float(positive_array("slack", slack)), float(following), CONTACT_END_LEVEL
     _statistics_of_rows(tuple(rows), floor.compiled_parameters, *sums, out)
@@ -245,7 +245,7 @@ class ContactDetector:
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
         """Process N `DetectorSamples` of a log; return (N,) True for contact."""
-        rows = check_samples(*samples)
+        rows = validate_detector_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _contact_flags_of_rows(self._memory, tuple(rows), self.settings, out)
         return out
@@ -279,7 +279,7 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     from scipy.optimize import nnls
 
-    rows = check_samples(contact, s, omega, alpha, acceleration)
+    rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < 100:
         raise DrakeTeleopError(
             f"{len(rows[0])} samples are too few for a noise floor",
