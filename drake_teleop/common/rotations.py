@@ -46,7 +46,7 @@ def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Arr
     return _matrices_from_quaternions(q)
 
 
-def rotation_error(R: Array) -> Array:
+def orthogonality_error(R: Array) -> Array:
     """Return max |R^T R - I| of matrices (..., 3, 3); at least 2 for reflections."""
     error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(R) < 0, np.maximum(error, 2.0), error)
@@ -60,7 +60,7 @@ def nearest_rotation(R: Array) -> Array:
     return R
 
 
-def quaternions_of(R: Array) -> Array:
+def quaternions_from_matrices(R: Array) -> Array:
     """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
     from scipy.spatial.transform import Rotation
 
