@@ -41,16 +41,12 @@ MIN_NOISE_OVER_WRENCH = 1e-7
 """Least noise of a channel relative to the wrench."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
 _FIT_ITERATIONS = 4
-_DELAY_SEARCH_RATE_HZ = 125.0
+_SEARCH_RATE_HZ = 125.0
 _RANK_TOLERANCE, _MIN_FULL_RANK_PIVOT = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _TRIED_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
-_MIN_COST_REDUCTION_BY_DRIFT = 3.0
-_CHOSEN_OVER_BEST_SPACING, _CHOSEN_OVER_BEST_SPACING_WITH_KNOWN_LOAD, _MIN_COST_RISE_OVER_DELAYS = (
-    0.84,
-    0.92,
-    25.0,
-)
+_MIN_DRIFT_COST_REDUCTION = 3.0
+_SPACING_MARGIN, _SPACING_MARGIN_WITH_KNOWN_LOAD, _MIN_DELAY_COST_RISE = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +73,19 @@ class LinearFit:
 
 def fit_linear_model(Z: Array, levels: NoiseLevels) -> LinearFit:
     """Fit the wrench by 16 signals of the motion, from second moments Z (bands, 38, 38)."""
-    return _fit_moments(
-        Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-        Z[:, :NUM_MOTION_SIGNALS, WRENCH_COLUMNS],
-        _wrench_powers(Z),
-        levels,
-    )
+    return _fit_moments(*_moments_of_signals_and_wrench(Z), levels)
 
 
-def _wrench_powers(Z: Array) -> Array:
-    return np.diagonal(Z[:, WRENCH_COLUMNS, WRENCH_COLUMNS], axis1=1, axis2=2)
+def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
+    zz = Z[..., :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS]
+    powers = np.diagonal(Z[..., WRENCH_COLUMNS, WRENCH_COLUMNS], axis1=-2, axis2=-1)
+    return zz, Z[..., :NUM_MOTION_SIGNALS, WRENCH_COLUMNS], powers
 
 
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    floor = _rounding_error_power_of_sums(ff, levels.sizes)
+    floor = _rounding_error_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -138,10 +131,10 @@ def _pseudo_inverses(gram: Array) -> Array:
 
 def rounding_error_power(Z: Array, sizes: Array) -> Array:
     """Return the power (6,) of rounding errors in the wrench channels."""
-    return _rounding_error_power_of_sums(_wrench_powers(Z), sizes)
+    return _rounding_error_power(_moments_of_signals_and_wrench(Z)[2], sizes)
 
 
-def _rounding_error_power_of_sums(ff: Array, sizes: Array) -> Array:
+def _rounding_error_power(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
     return np.maximum(MIN_NOISE_OVER_WRENCH**2 * both, 1e-60)
@@ -151,7 +144,7 @@ def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
     """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
     least, shape = (
-        fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION_BY_DRIFT,
+        fit_linear_model(Z, levels).costs - _MIN_DRIFT_COST_REDUCTION,
         levels.shape.copy(),
     )
     for corner in _TRIED_DRIFT_CORNERS_HZ:
@@ -211,12 +204,8 @@ class Spectra:
     def fit_coefficients(self) -> LinearFit:
         """Fit the coefficients of all signals, or only the constants if the load is known."""
         Z, load = second_moments(self.signals, self.wrench, self.bands), self.grid.known_load
-        parts = (
-            Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-            Z[:, :NUM_MOTION_SIGNALS, WRENCH_COLUMNS],
-            _wrench_powers(Z),
-        )
-        fit = _fit_moments(*parts, NoiseLevels.white_within_groups(self.bands), load)
+        levels = NoiseLevels.white_within_groups(self.bands)
+        fit = _fit_moments(*_moments_of_signals_and_wrench(Z), levels, load)
         if load is None:
             return fit
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
@@ -227,21 +216,12 @@ class Spectra:
             Z = np.array(
                 [second_moments(x.signals, x.wrench, x.bands) for x in map(self.with_delay, delays)]
             )
-            zz, zf = (
-                Z[..., :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-                Z[..., :NUM_MOTION_SIGNALS, WRENCH_COLUMNS],
-            )
+            zz, zf, _ = _moments_of_signals_and_wrench(Z)
         else:
             zz, zf = self._delayed_moments(np.asarray(delays))
-        power = np.abs(self.wrench) ** 2
-        fits = _fit_moments(
-            zz,
-            zf,
-            self.bands.sums_over_bands(power),
-            NoiseLevels.white_within_groups(self.bands),
-            self.grid.known_load,
-        )
-        return fits.costs.sum(axis=-1)
+        ff = self.bands.sums_over_bands(np.abs(self.wrench) ** 2)
+        levels = NoiseLevels.white_within_groups(self.bands)
+        return _fit_moments(zz, zf, ff, levels, self.grid.known_load).costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
         """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
@@ -319,7 +299,7 @@ def delay_deviation(spectra: Spectra) -> float:
     left, least, right = spectra.costs_at_delays(spectra.delay + beside)
     far = spectra.costs_at_delays(spectra.delay + np.arange(-reach, reach, _COARSE_DELAY_STEP_S))
     bend = left - 2.0 * least + right
-    if bend <= 0.0 or far.max() - least < _MIN_COST_RISE_OVER_DELAYS or far.min() < least - 1.0:
+    if bend <= 0.0 or far.max() - least < _MIN_DELAY_COST_RISE or far.min() < least - 1.0:
         return np.inf
     return float(_FINE_DELAY_STEP_S / np.sqrt(bend))
 
@@ -370,11 +350,7 @@ def choose_knot_spacing(
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
-    finer = (
-        _CHOSEN_OVER_BEST_SPACING
-        if window.grid.known_load is None
-        else _CHOSEN_OVER_BEST_SPACING_WITH_KNOWN_LOAD
-    )
+    finer = _SPACING_MARGIN if window.grid.known_load is None else _SPACING_MARGIN_WITH_KNOWN_LOAD
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
         last = start.with_motion(cache.splines_with_spacing(best), window.gravity_W, delay)
@@ -384,9 +360,7 @@ def choose_knot_spacing(
 
 def splines_of_averaged_poses(poses: Poses) -> SplineCache:
     """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(
-        poses.average_consecutive(max(1, int(poses.rate / _DELAY_SEARCH_RATE_HZ + 1e-6)))
-    )
+    return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
 def _neighbouring_spacings(h: float, spacings: list[float]) -> list[float]:
