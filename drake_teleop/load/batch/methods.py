@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
     EstimatorFit,
     EstimatorOptions,
@@ -25,7 +25,6 @@ from drake_teleop.load.batch.uncertainty import (
     covariance_for_random_walks,
     covariance_for_white_noise,
     covariance_of_solution,
-    covariance_with_prior,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
@@ -94,7 +93,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
-    theta = consistent_least_squares(gram, right, theta, options.prior, options.ellipsoid)
+    theta = consistent_least_squares(gram, right, theta)
     return replace(fit, form=fit.form._replace(theta=theta))
 
 
@@ -178,8 +177,6 @@ def identify_batch(
     offsets: bool = True,
     shared_noise: bool = False,
     resolution: tuple[float, float] = (0.0, 0.0),
-    prior: Prior | None = None,
-    ellipsoid: Ellipsoid | None = None,
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
@@ -197,15 +194,10 @@ def identify_batch(
     expect_type((NoiseStd, type(None)), noise, "noise")
     if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
-    if method != "consistent" and (prior, ellipsoid) != (None, None):
-        raise DrakeTeleopError(
-            f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
-        )
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     record = SampleRecord(*rows)
-    fit = METHODS[method].fit(
-        record, EstimatorOptions(noise or NoiseStd(), offsets, shared_noise, prior, ellipsoid)
-    )
+    options = EstimatorOptions(noise or NoiseStd(), offsets, shared_noise)
+    fit = METHODS[method].fit(record, options)
     equations = NormalEquations(
         np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
     )
@@ -223,19 +215,12 @@ def identify_batch(
         covariance += (
             np.outer(known, known) * gain_std**2 * covariance_for_gain_errors(fit, offsets)
         )
-    dominated = np.zeros(16, bool)
-    if prior is not None:
-        covariance, dominated = covariance_with_prior(
-            covariance, prior.inverse_covariance(plain.samples)
-        )
-    deviations = np.sqrt(np.diag(covariance))
     identification = replace(
         plain,
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=is_precise_enough(deviations, theta[6:]) & ~dominated,
-        prior_dominated=dominated,
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
         method=METHODS[method].name,
     )

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.moments import (
     NoiseStd,
     SecondMoments,
@@ -137,8 +136,6 @@ class EstimatorOptions:
     noise: NoiseStd
     offsets: bool = True
     shared_noise: bool = False
-    prior: Prior | None = None
-    ellipsoid: Ellipsoid | None = None
 
 
 @dataclass(frozen=True, eq=False)

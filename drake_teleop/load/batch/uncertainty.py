@@ -193,26 +193,6 @@ TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
-def covariance_with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior; (16,) True where the prior dominates."""
-    determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
-    used = determined | (np.arange(16) >= 6)
-    # Scaled so that all entries have similar size.
-    scale = np.sqrt(np.where(determined, np.diag(covariance), 1.0))
-    scale[6:] = np.diag(information) ** -0.5
-    data, total = np.zeros((2, 16, 16))
-    block, used_block = np.ix_(determined, determined), np.ix_(used, used)
-    data[block] = np.linalg.inv(covariance[block] / np.outer(scale, scale)[block])
-    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
-    total += data
-    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
-    inverse = np.linalg.inv(total[used_block])
-    posterior[used_block] = inverse * np.outer(scale, scale)[used_block]
-    prior_share = np.zeros(16)
-    prior_share[used] = 1.0 - np.diag(inverse @ data[used_block])
-    return posterior, is_prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
-
-
 def covariance_for_white_noise(
     plain: Array, equations: NormalEquations, fit: EstimatorFit
 ) -> Array:
