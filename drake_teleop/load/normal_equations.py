@@ -94,7 +94,14 @@ class NormalEquations(SecondMoments):
         )
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
-        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_columns)
+        gram, unexcited = self.normal_equations()[0], self.unexcited_columns
+        scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
+        eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+        kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+        half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
+        undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
+        condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
+        return half @ half.T, undetermined, condition_number
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
         weights = self._weights if weights is None else finite_array("weights", weights, 6)
@@ -107,10 +114,6 @@ class NormalEquations(SecondMoments):
     @property
     def unexcited_columns(self) -> NDArray[np.bool_]:
         return ~excited_columns(self.mean_products)
-
-    @property
-    def channel_weights(self) -> Array:
-        return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
         squares = np.diag(residual_covariance(self._sums, finite_array("theta", theta, 16)))
@@ -245,15 +248,3 @@ def identify(
 
 def _regressors_of_blocks(blocks: Array) -> Array:
     return np.asarray(np.einsum("cjk,bk->bcj", regressor_coefficients(), blocks))
-
-
-def _pseudo_inverse(
-    gram: Array, unexcited: NDArray[np.bool_]
-) -> tuple[Array, NDArray[np.bool_], float]:
-    scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
-    eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
-    half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
-    undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
-    condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
-    return half @ half.T, undetermined, condition_number

@@ -482,7 +482,7 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     rows = np.zeros((kept.sum(), 6, 16))
     rows[:, :, :6] = np.eye(6)
     rows[:, :, 6:] = regressor(*(table[kept] for table in motion))
-    weighted = rows * with_walk.equations.channel_weights[:, None]
+    weighted = rows * with_walk.equations._weights[:, None]
     inverse = np.linalg.inv(np.einsum("nci,ncj->ij", rows, weighted))
     expected = np.einsum("nci,nm,mdj,cd->ij", weighted, walked, weighted, covariance)
     added = with_walk.identification.covariance - without.identification.covariance

@@ -40,21 +40,15 @@ _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 _MIN_NUMBERED_TERM_SHARE, _MIN_ELLIPSIS_TERM_SHARE = 0.1, 0.01
 
 
-def confidence_intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi]."""
-    if not 0.0 < level < 1.0:
-        raise DrakeTeleopError(
-            f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
-        )
+def confidence_intervals(load: Identification) -> tuple[Array, Array]:
+    """Return lower and upper ends (16,) of the 95 % confidence intervals of [offsets; phi]."""
     degrees = np.minimum(load.degrees_of_freedom, _MAX_DEGREES_OF_FREEDOM)
-    half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
+    half = stdtrit(degrees, 0.5 + 0.5 * 0.95) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
     return theta - half, theta + half
 
 
-def is_prior_dominated(
-    standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
-) -> NDArray[np.bool_]:
+def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> NDArray[np.bool_]:
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
@@ -62,7 +56,7 @@ def is_prior_dominated(
             where="prior_std",
             remedy=f"give positive numbers of shape {deviations.shape}",
         )
-    return np.asarray(deviations >= share * prior)
+    return np.asarray(deviations >= 0.5 * prior)
 
 
 @dataclass(frozen=True, eq=False)

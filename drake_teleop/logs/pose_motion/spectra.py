@@ -11,6 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.load.moments import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
     NUM_MOTION_SIGNALS,
     PoseSplines,
@@ -321,14 +322,8 @@ def _signal_covariances_by_rotation(
     for where in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         cross[where, _ALPHA_COLUMNS] = -cross_matrix(mean[where])
         cross[_ALPHA_COLUMNS, where] = cross[where, _ALPHA_COLUMNS].T
-    jacobian = np.zeros(
-        (3, 3, NUM_MOTION_SIGNALS)
-    )  # derivative of the signals by omega_j, coefficient of omega_i
-    for i in range(3):
-        for j in range(3):
-            jacobian[j, i, OMEGA_PRODUCT_COLUMNS[i, j]] += 1.0 + (i == j)
     ww = mean[OMEGA_PRODUCT_COLUMNS]
-    for k in range(3):
-        products += jacobian[k].T @ ww @ jacobian[k]
+    for jacobian in omega_product_jacobians(OMEGA_PRODUCT_COLUMNS, NUM_MOTION_SIGNALS):
+        products += jacobian.T @ ww @ jacobian
     alpha[_ALPHA_COLUMNS, _ALPHA_COLUMNS] = np.eye(3)
     return still, cross, products, alpha
