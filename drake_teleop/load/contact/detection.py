@@ -33,16 +33,11 @@ from drake_teleop.load.contact.noise_floor import (
 )
 
 # Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
-# below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6); sum of all
-# e (6); ring of its last WINDOW values.
+# below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
+# sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
 SAMPLE_COUNT_INDEX, FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 0, 3, 4, 5
-NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START, TOTAL_SUM_START, RING_BUFFER_START = (
-    8,
-    14,
-    20,
-    26,
-    32,
-)
+NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START = 8, 14, 20
+TOTAL_SUM_START, RING_BUFFER_START = 26, 32
 MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
 """Length of the memory of `update_statistics`."""
 DEFAULT_SLACK = 1.0
