@@ -32,9 +32,16 @@ _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
-    return _fit_with_usual_delay_if_undetermined(
-        log, delay, lambda late: _estimate_load_and_motion(log, late), 0.0, "undetermined"
-    )
+    posed = log.posed
+    assert posed is not None
+
+    def estimate_at_delay(late: float | None) -> PoseEstimate:
+        arrays = log.t, log.wrench, posed.poses, posed.gravity_W
+        return estimate_from_poses(
+            *arrays, delay=late, gain=log.gain_std, lost=log.bridged, imu=posed.imu
+        )
+
+    return _fit_with_usual_delay_if_undetermined(log, delay, estimate_at_delay, 0.0, "undetermined")
 
 
 def fit_motion_to_known_load(
@@ -73,20 +80,6 @@ def _fit_with_usual_delay_if_undetermined(
     if known is None and not found.delay_deviation_s < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
-
-
-def _estimate_load_and_motion(log: Log, delay: float | None) -> PoseEstimate:
-    assert log.posed is not None
-    return estimate_from_poses(
-        log.t,
-        log.wrench,
-        log.posed.poses,
-        log.posed.gravity_W,
-        delay=delay,
-        gain=log.gain_std,
-        lost=log.bridged,
-        imu=log.posed.imu,
-    )
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:

@@ -74,7 +74,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{_note_for_table(log)}"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{note_for_table(log)}"
     )
 
 
@@ -99,11 +99,11 @@ def _correct_fields(
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{_note_for_table(log)}" if lines else otherwise)
+        texts.append(f"set {lines}{note_for_table(log)}" if lines else otherwise)
     return fields, texts, corrected
 
 
-def _note_for_table(log: Log) -> str:
+def note_for_table(log: Log) -> str:
     return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 

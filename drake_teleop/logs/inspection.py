@@ -75,7 +75,7 @@ def _describe_canonical(log: Path, table: Table) -> Description:
         return describe_canonical(log, table)
     except DrakeTeleopError:
         # A canonical log with NaN or a missing column gets the specific message.
-        return describe_canonical(log, _remove_nonfinite_rows(table, list(table.columns)))
+        return describe_canonical(log, _remove_nonfinite_rows(table))
 
 
 def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
@@ -323,15 +323,11 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
 
 
-def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:
-    if len({len(table.raw(name, name)) for name in names}) != 1:
+def _remove_nonfinite_rows(table: Table) -> Table:
+    columns = [table.raw(name, name) for name in table.columns]
+    if len({len(x) for x in columns}) != 1:
         return table
-    good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
-    if good.all():
-        return table
-    rows = len(good)
-    kept = {n: x[good] if len(x) == rows else x for n, x in table.columns.items()}
-    return replace(table, columns=kept)
+    return _remove_rows(table, np.flatnonzero(~np.isfinite(np.hstack(columns)).all(axis=1)))
 
 
 def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,10 @@ from drake_teleop.logs.aligned_log import (
 )
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
+from drake_teleop.logs.explained_log import note_for_table
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import YAML_ONLY_NOTE
-from drake_teleop.logs.read.table_files import TABLE_READERS
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
@@ -81,8 +79,7 @@ def fit_load_to_posed_log(
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        if Path(log.source).suffix.lower() in TABLE_READERS:
-            finding = replace(finding, message=f"{finding.message} ({YAML_ONLY_NOTE})")
+        finding = replace(finding, message=f"{finding.message}{note_for_table(log)}")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 

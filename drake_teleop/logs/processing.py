@@ -388,12 +388,7 @@ def eliminate_log(
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
-        source = (free_motion if free_motion.log.static else found).log.source
-        raise DrakeTeleopError(
-            "contains only poses at rest (`static`), in which no contact can be detected",
-            where=source,
-            remedy="give a log of a motion",
-        )
+        raise _static_log_error((free_motion if free_motion.log.static else found).log)
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
@@ -409,6 +404,14 @@ def eliminate_log(
         notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
+
+
+def _static_log_error(log: Log) -> DrakeTeleopError:
+    return DrakeTeleopError(
+        "contains only poses at rest (`static`), in which no contact can be detected",
+        where=log.source,
+        remedy="give a log of a motion",
+    )
 
 
 def _read_and_eliminate_log(
@@ -658,11 +661,7 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise DrakeTeleopError(
-            "contains only poses at rest (`static`), in which no contact can be detected",
-            where=found.log.source,
-            remedy="give a log of a motion",
-        )
+        raise _static_log_error(found.log)
     if found.detection is None:
         raise DrakeTeleopError(
             f"{len(found.log)} samples are too few to separate contact from noise",
