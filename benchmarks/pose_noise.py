@@ -219,7 +219,7 @@ def one(case: Case, motion: str, seed: int, chain: str) -> dict[str, Any]:
             "turn": turn.tolist(),
             "turn_std": found.frame.rotation_deviations_deg.tolist(),
             "named": found.frame.is_shifted or found.frame.is_rotated,
-            "knots": found.spacing,
+            "knots": found.splines.spacing,
             "misfit": found.fit.misfit,
             "delay": found.delay_s,
             "rejected": float(found.rejected.mean()),

@@ -122,13 +122,6 @@ class SecondMoments:
             Q += std**2 * J.T @ products @ J
         return Q
 
-    @staticmethod
-    def walk_covariance(noise: NoiseStd) -> Array:
-        """Return the covariance (19, 19) of a random-walk step of z, Eq. (T4)."""
-        Q = np.zeros((19, 19))
-        Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
-        return Q
-
 
 @cache
 def regressor_coefficients() -> Array:

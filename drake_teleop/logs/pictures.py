@@ -55,7 +55,23 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
     with plot_style():
         figure = Picture(figsize=(10, 7))
-        _draw_fit_into(figure, found)
+        log, result = found.log, found.identification
+        curves = [
+            ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
+            (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
+            ("residual", log.wrench - found.predicted, VERMILION),
+        ]
+        rms = np.asarray(result.residual_rms)
+        com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
+        title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
+        axes = _channel_axes(figure)
+        for i, axis in enumerate(axes):
+            _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
+            unit = "N" if i < 3 else "N m"
+            axis.set_title(f"{_CHANNEL_SYMBOLS[i]}: residual {rms[i]:.3g} {unit} rms")
+            if not log.static:
+                shade_contact(axis, log.t, found.rejected)
+        _add_labels_and_title(figure, axes, title, log, result.delay_s)
     return figure
 
 
@@ -63,7 +79,35 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
-        _draw_spectrum_and_intervals_into(figure, found)
+        log, result = found.log, found.identification
+        residual = log.wrench - found.predicted
+        if log.static:
+            rate, shown = 1.0 + np.arange(len(log)), residual
+        else:
+            rate, shown = amplitude_spectral_densities(residual, log.dt)
+        spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
+        left, right = spectra.subplots(1, 2)
+        for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
+            curves = zip(
+                _CHANNEL_SYMBOLS[columns],
+                (BLUE, VERMILION, GREEN),
+                shown[:, columns].T,
+                strict=True,
+            )
+            for name, colour, values in curves:
+                if log.static:
+                    axis.plot(rate, values, "o", color=colour, label=name)
+                else:
+                    axis.loglog(rate, values, color=colour, label=name)
+            if log.static:
+                axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
+            else:
+                axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
+                # Frequencies above the cut-off do not show sensor noise.
+                top = axis.get_ylim()[1]
+                axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
+            axis.legend(ncols=3)
+        _draw_parameter_intervals(known, result)
     return figure
 
 
@@ -85,55 +129,6 @@ def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
     length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW)
     rates, power = welch(x, 1.0 / dt, nperseg=length, axis=0)
     return rates[1:], np.sqrt(power[1:])
-
-
-def _draw_fit_into(figure: Any, found: IdentifiedLog) -> None:
-    log, result = found.log, found.identification
-    curves = [
-        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
-        (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
-        ("residual", log.wrench - found.predicted, VERMILION),
-    ]
-    rms = np.asarray(result.residual_rms)
-    com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
-    title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
-    axes = _channel_axes(figure)
-    for i, axis in enumerate(axes):
-        _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
-        unit = "N" if i < 3 else "N m"
-        axis.set_title(f"{_CHANNEL_SYMBOLS[i]}: residual {rms[i]:.3g} {unit} rms")
-        if not log.static:
-            shade_contact(axis, log.t, found.rejected)
-    _add_labels_and_title(figure, axes, title, log, result.delay_s)
-
-
-def _draw_spectrum_and_intervals_into(figure: Any, found: IdentifiedLog) -> None:
-    log, result = found.log, found.identification
-    residual = log.wrench - found.predicted
-    if log.static:
-        rate, shown = 1.0 + np.arange(len(log)), residual
-    else:
-        rate, shown = amplitude_spectral_densities(residual, log.dt)
-    spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
-    left, right = spectra.subplots(1, 2)
-    for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-        curves = zip(
-            _CHANNEL_SYMBOLS[columns], (BLUE, VERMILION, GREEN), shown[:, columns].T, strict=True
-        )
-        for name, colour, values in curves:
-            if log.static:
-                axis.plot(rate, values, "o", color=colour, label=name)
-            else:
-                axis.loglog(rate, values, color=colour, label=name)
-        if log.static:
-            axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
-        else:
-            axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
-            # Frequencies above the cut-off do not show sensor noise.
-            top = axis.get_ylim()[1]
-            axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
-        axis.legend(ncols=3)
-    _draw_parameter_intervals(known, result)
 
 
 def _draw_parameter_intervals(figure: Any, result: Identification) -> None:

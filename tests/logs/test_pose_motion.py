@@ -390,7 +390,7 @@ def test_weights_recover_from_a_poor_start():
 
 def test_coloured_noise_does_not_select_the_finest_knots():
     kind = Kind(place=3e-4, turn=6e-4, rate=250.0, colour=0.95, seed=6)
-    assert estimate(kind).spacing >= 0.05
+    assert estimate(kind).splines.spacing >= 0.05
 
 
 def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> UnitsAndAxes:

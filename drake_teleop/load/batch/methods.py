@@ -205,7 +205,8 @@ def identify_batch(
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean_products
-    steps = residual_covariance(SecondMoments.walk_covariance(noise or NoiseStd()), theta)
+    walk = np.square(np.broadcast_to(options.noise.walk, 12))
+    steps = residual_covariance(np.diag(np.pad(walk, (1, 6))), theta)
     white = covariance_for_white_noise(plain.covariance, equations, fit)
     covariance = covariance_of_solution(
         white + covariance_for_random_walks(record, kept, fit, steps), fit.form, offsets

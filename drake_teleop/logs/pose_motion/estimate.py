@@ -108,11 +108,6 @@ class PoseMotion:
     clock_rate_error: float
     is_imu_consistent: bool
 
-    @property
-    def spacing(self) -> float:
-        """Distance of the knots [s]."""
-        return self.splines.spacing
-
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate(PoseMotion):
