@@ -110,10 +110,8 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        deviations, named = (
-            self.standard_deviations,
-            zip(PARAMETER_NAMES, self.verdicts, strict=True),
-        )
+        deviations = self.standard_deviations
+        named = zip(PARAMETER_NAMES, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
         force, torque = (np.linalg.norm(part) for part in np.split(self.residual_rms, 2))

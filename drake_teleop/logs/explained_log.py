@@ -31,12 +31,10 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
 _MAX_MASS_KG = 1000.0
-_SIGN_FIELD, _FRAME_FIELD, _WEIGHT_FIELD, _GRAVITY_FIELD = (
-    "wrench.sign",
-    "wrench.frame",
-    "wrench.weight",
-    "gravity",
-)
+_SIGN_FIELD = "wrench.sign"
+_FRAME_FIELD = "wrench.frame"
+_WEIGHT_FIELD = "wrench.weight"
+_GRAVITY_FIELD = "gravity"
 _FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD = "wrench.force.scale", "wrench.torque.scale"
 _FORCE_UNIT_FIELD, _TORQUE_UNIT_FIELD = "wrench.force.unit", "wrench.torque.unit"
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
@@ -181,10 +179,8 @@ def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -
 
 
 def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    force, torque = (
-        SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]],
-        SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]],
-    )
+    force = SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]]
+    torque = SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]]
     ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
     ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:

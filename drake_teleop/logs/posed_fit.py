@@ -93,10 +93,8 @@ def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
     few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
     for start in range(0, len(few), _CHUNK_SAMPLES):  # in chunks, to save memory
-        before, stop = (
-            max(0, start - _FILTER_NEIGHBOURS),
-            start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS,
-        )
+        before = max(0, start - _FILTER_NEIGHBOURS)
+        stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
     bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]

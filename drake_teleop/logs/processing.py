@@ -482,10 +482,8 @@ def _read_and_eliminate_log(
     scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
     if causal is not None and aligned.log_with_differentiated_motion is not None:
-        causal_offsets, motion = (
-            identification.offsets,
-            aligned.log_with_differentiated_motion.motion,
-        )
+        causal_offsets = identification.offsets
+        motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
             causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(

@@ -94,10 +94,8 @@ class NoiseFloor:
         positive_array("noise", self.noise, 6)
         finite_array("covariance", self.covariance, 16, 16)
         finite_array("per_acceleration", self.per_acceleration, 6, 2)
-        correlation, rho = (
-            finite_array("correlation", self.correlation, 6, 6),
-            finite_array("rho", self.rho, 6),
-        )
+        correlation = finite_array("correlation", self.correlation, 6, 6)
+        rho = finite_array("rho", self.rho, 6)
         if (np.abs(rho) >= 1.0).any():
             raise DrakeTeleopError(
                 "has a value that is not between -1 and 1",

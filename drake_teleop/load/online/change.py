@@ -176,10 +176,8 @@ def _restart_filter(memory, place):
 
 @njit(cache=True)
 def _is_identified(memory, bound):
-    theta, P = (
-        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
-        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
-    )
+    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
+    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = bound * change * max(size, _MIN_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
@@ -189,10 +187,8 @@ def _is_identified(memory, bound):
 
 @njit(cache=True)
 def _inflate_inertia_variances(memory, noise, block):
-    theta, P = (
-        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
-        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
-    )
+    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
+    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -205,11 +201,9 @@ def _inflate_inertia_variances(memory, noise, block):
 def update_change_detector(memory, sample, block, noise, window, hold, bound):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = sample[SAMPLE_SPECIFIC_FORCE]
+    omega = sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     regressor_into(s, omega, alpha, V)
     known = sample[SAMPLE_WRENCH_AND_MOTION]
     for i in range(15):
@@ -262,10 +256,8 @@ def _test_block(memory, block, noise, window, hold, bound):
         memory[_NEW_SQUARES_START + c] += residual * residual
     memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     # A clearly negative mass is not a load.
-    mass, deviation = (
-        memory[_NEW_FILTER_START + 6],
-        math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6]),
-    )
+    mass = memory[_NEW_FILTER_START + 6]
+    deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
     if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_filter(memory, _NEW_FILTER_START)
@@ -400,10 +392,8 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    phi, P = (
-        memory[_KNOWN_LOAD_START + 6 : _KNOWN_LOAD_START + 16].copy(),
-        memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START],
-    )
+    phi = memory[_KNOWN_LOAD_START + 6 : _KNOWN_LOAD_START + 16].copy()
+    P = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START]
     covariance = P.reshape(16, 16).copy()
     return replace(
         known,

@@ -59,11 +59,9 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             for c in range(6):
                 squares[c] *= forgetting
 
-        wrench, s, omega = (
-            sample[SAMPLE_WRENCH],
-            sample[SAMPLE_SPECIFIC_FORCE],
-            sample[SAMPLE_ANGULAR_VELOCITY],
-        )
+        wrench = sample[SAMPLE_WRENCH]
+        s = sample[SAMPLE_SPECIFIC_FORCE]
+        omega = sample[SAMPLE_ANGULAR_VELOCITY]
         regressor_into(s, omega, sample[SAMPLE_ANGULAR_ACCELERATION], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)

@@ -124,11 +124,9 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     watch = memory[_CHANGE_DETECTOR_START:]
     update_change_detector(watch, sample, block, noise, window, hold, bound)
     known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = sample[SAMPLE_SPECIFIC_FORCE]
+    omega = sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     non_contact_wrench_into(s, omega, alpha, known[6:], residual)
     wrench = sample[SAMPLE_WRENCH]
     for i in range(6):

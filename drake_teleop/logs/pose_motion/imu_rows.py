@@ -98,12 +98,10 @@ def _fit_sensor_model(
 
     # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
-    Y, one, tau, power = (
-        tapered_spectrum(values),
-        tapered_spectrum(np.ones((len(even), 1))),
-        0.0,
-        least,
-    )
+    Y = tapered_spectrum(values)
+    one = tapered_spectrum(np.ones((len(even), 1)))
+    tau = 0.0
+    power = least
     for step in range(_MAX_FIT_STEPS):
         x = splines.motion(even + tau, gravity_W)[which]
         X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))

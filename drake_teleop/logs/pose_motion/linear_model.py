@@ -143,10 +143,8 @@ def _rounding_error_power(ff: Array, sizes: Array) -> Array:
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
     """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
-    least, shape = (
-        fit_linear_model(Z, levels).costs - _MIN_DRIFT_COST_REDUCTION,
-        levels.shape.copy(),
-    )
+    least = fit_linear_model(Z, levels).costs - _MIN_DRIFT_COST_REDUCTION
+    shape = levels.shape.copy()
     for corner in _TRIED_DRIFT_CORNERS_HZ:
         rising = np.repeat(random_walk_shape(bands, corner)[:, None], 6, axis=1)
         costs = fit_linear_model(Z, replace(levels, shape=rising)).costs

@@ -36,10 +36,8 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     if grid.known_load is None:
         x = test_signals = x[:, used] / size[used]
     else:
-        y, test_signals = (
-            y - x @ grid.known_load.T,
-            x[:, COLUMNS_ZERO_AT_REST] @ grid.known_load[:3, COLUMNS_ZERO_AT_REST].T,
-        )
+        y = y - x @ grid.known_load.T
+        test_signals = x[:, COLUMNS_ZERO_AT_REST] @ grid.known_load[:3, COLUMNS_ZERO_AT_REST].T
         x, test_signals = x[:, :1] / size[0], np.linalg.norm(test_signals, axis=1, keepdims=True)
     weights = inside.astype(float)
     for _ in range(_MAX_FITS):
@@ -50,10 +48,8 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
             break
     rejected = np.zeros(len(x), bool)
     for _ in range(_MAX_FITS):
-        last, rejected = (
-            rejected,
-            _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT,
-        )
+        last = rejected
+        rejected = _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break

@@ -23,12 +23,10 @@ from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SI
 
 NUM_PARAMETERS = 23
 """Number of parameters: [offsets; phi] (16), tau, r (3), rho (3)."""
-OFFSET_AND_LOAD_PARAMETERS, DELAY_PARAMETER, LEVER_PARAMETERS, ROTATION_PARAMETERS = (
-    slice(0, 16),
-    slice(16, 17),
-    slice(17, 20),
-    slice(20, 23),
-)
+OFFSET_AND_LOAD_PARAMETERS = slice(0, 16)
+DELAY_PARAMETER = slice(16, 17)
+LEVER_PARAMETERS = slice(17, 20)
+ROTATION_PARAMETERS = slice(20, 23)
 _MAX_FIT_STEPS, _CONVERGENCE_TOLERANCE = 40, 1e-4
 _MAX_RIGID_MISFIT_OVER_DEGREES, _GAIN_MISFIT_MARGIN, _NOISE_MISFIT_OVER_DEGREES = 4.0, 1.5, 1.5
 _MAX_PARAMETER_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
@@ -223,12 +221,10 @@ def _solve_rigid_fit(
 def _parameter_covariance(
     record: _FitData, solution: _RigidSolution, inflation: float, gain: float
 ) -> Array:
-    B, W, inverse, undetermined = (
-        solution.derivative,
-        solution.weights,
-        solution.inverse_gram,
-        solution.undetermined,
-    )
+    B = solution.derivative
+    W = solution.weights
+    inverse = solution.inverse_gram
+    undetermined = solution.undetermined
     middle = _normal_equations(
         B, np.zeros((6, MOMENTS_SIZE)), record.moments, W @ solution.residual_covariances @ W
     )[0]
