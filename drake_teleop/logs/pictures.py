@@ -78,7 +78,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
-        figure = Picture(figsize=(10, 7.4))
+        figure: Any = Picture(figsize=(10, 7.4))
         log, result = found.log, found.identification
         residual = log.wrench - found.predicted
         if log.static:
