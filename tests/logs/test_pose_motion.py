@@ -470,9 +470,7 @@ def test_gain_effects_predict_the_change_of_the_estimate():
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit_coefficients().power
     solution = _solve_rigid_fit(_FitData(Z, none, levels, free, power), start)
-    effects = _parameter_errors_of_unit_gains(
-        solution.derivative, Z, solution.weights, solution.inverse_gram
-    ).reshape(23, 6, 6)
+    effects = _parameter_errors_of_unit_gains(solution, Z).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)

@@ -80,19 +80,15 @@ class RigidFit:
     @property
     def is_explained_by_gains(self) -> bool:
         """Whether a rigid load with the stated gain errors explains the wrench."""
-        return (
-            self.misfit
-            < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom
-            + _GAIN_MISFIT_MARGIN * self.misfit_of_gains
-        )
+        by_gains = _GAIN_MISFIT_MARGIN * self.misfit_of_gains
+        return self.misfit < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom + by_gains
 
     @property
     def deviation_inflation(self) -> float:
         """Factor (>= 1) on standard deviations due to misfit."""
         left = self.misfit - _GAIN_MISFIT_MARGIN * self.misfit_of_gains
-        return float(
-            np.sqrt(max(1.0, left / (_NOISE_MISFIT_OVER_DEGREES * self.degrees_of_freedom)))
-        )
+        by_noise = _NOISE_MISFIT_OVER_DEGREES * self.degrees_of_freedom
+        return float(np.sqrt(max(1.0, left / by_noise)))
 
 
 def motion_transformation_matrix(R: Array, r: Array) -> Array:
@@ -171,9 +167,8 @@ def fit_rigid(
     if not fit.is_rigid:
         solution = _solve_rigid_fit(record, solution.state, one_weight=True)
         fit = replace(fit, state=solution.state, has_one_weight=True)
-    return replace(
-        fit, covariance=_parameter_covariance(record, solution, fit.deviation_inflation, gain)
-    )
+    covariance = _parameter_covariance(record, solution, fit.deviation_inflation, gain)
+    return replace(fit, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,20 +216,16 @@ def _solve_rigid_fit(
 def _parameter_covariance(
     record: _FitData, solution: _RigidSolution, inflation: float, gain: float
 ) -> Array:
-    B = solution.derivative
-    W = solution.weights
-    inverse = solution.inverse_gram
-    undetermined = solution.undetermined
-    middle = _normal_equations(
-        B, np.zeros((6, MOMENTS_SIZE)), record.moments, W @ solution.residual_covariances @ W
-    )[0]
+    inverse, undetermined = solution.inverse_gram, solution.undetermined
+    W, none = solution.weights, np.zeros((6, MOMENTS_SIZE))
+    W = W @ solution.residual_covariances @ W
+    middle = _normal_equations(solution.derivative, none, record.moments, W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
     if gain:
-        effects = gain * _parameter_errors_of_unit_gains(
-            B, record.moments - record.noise_moments, W, inverse
-        )
+        clean = record.moments - record.noise_moments
+        effects = gain * _parameter_errors_of_unit_gains(solution, clean)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -336,20 +327,17 @@ def _used_degrees_of_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Ar
     return np.asarray(np.clip(gram * diagonal, 0.0, None))
 
 
-def _parameter_errors_of_unit_gains(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, WRENCH_COLUMNS].reshape(
-        len(Z), 6, NUM_PARAMETERS, 6
-    )
-    return parameter_errors_by_gains(BF, W, inverse)
+def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:
+    BF = (solution.derivative.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, WRENCH_COLUMNS]
+    BF = BF.reshape(len(Z), 6, NUM_PARAMETERS, 6)
+    return parameter_errors_by_gains(BF, solution.weights, solution.inverse_gram)
 
 
 def _misfit_of_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
     if gain == 0.0:
         return 0.0
     B, levels = solution.derivative, record.levels
-    effects = _parameter_errors_of_unit_gains(
-        B, record.moments, solution.weights, solution.inverse_gram
-    )
+    effects = _parameter_errors_of_unit_gains(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
