@@ -384,7 +384,7 @@ def test_weights_recover_from_a_poor_start():
         np.arange(23) < 17,
         spectra.fit_coefficients(),
     )
-    assert not fit.has_one_weight
+    assert fit.is_rigid
     assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
 
 
@@ -437,7 +437,7 @@ def test_planar_gravity_determines_the_unit_but_not_the_axes():
 
 def test_gain_errors_cause_a_misfit_unless_they_are_stated():
     found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain=0.01)
-    assert not found.fit.is_rigid and found.fit.has_one_weight
+    assert not found.fit.is_rigid
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
     # Stated gain errors enter the deviations only once.

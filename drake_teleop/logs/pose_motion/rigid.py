@@ -62,7 +62,6 @@ class RigidFit:
         misfit, degrees_of_freedom: twice the log likelihood ratio to the linear model, and its
             degrees of freedom.
         misfit_of_gains: expected increase of the misfit by the stated gain errors.
-        has_one_weight: whether all frequency bands had the same weight.
     """
 
     state: RigidParameters
@@ -70,7 +69,6 @@ class RigidFit:
     misfit: float
     degrees_of_freedom: float
     misfit_of_gains: float = 0.0
-    has_one_weight: bool = False
 
     @property
     def is_rigid(self) -> bool:
@@ -166,7 +164,7 @@ def fit_rigid(
     )
     if not fit.is_rigid:
         solution = _solve_rigid_fit(record, solution.state, one_weight=True)
-        fit = replace(fit, state=solution.state, has_one_weight=True)
+        fit = replace(fit, state=solution.state)
     covariance = _parameter_covariance(record, solution, fit.deviation_inflation, gain)
     return replace(fit, covariance=covariance)
 
