@@ -94,14 +94,7 @@ class NormalEquations(SecondMoments):
         )
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
-        gram, unexcited = self.normal_equations()[0], self.unexcited_columns
-        scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
-        eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-        kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
-        half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
-        undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
-        condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
-        return half @ half.T, undetermined, condition_number
+        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_columns)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
         weights = self._weights if weights is None else finite_array("weights", weights, 6)
@@ -248,3 +241,15 @@ def identify(
 
 def _regressors_of_blocks(blocks: Array) -> Array:
     return np.asarray(np.einsum("cjk,bk->bcj", regressor_coefficients(), blocks))
+
+
+def _pseudo_inverse(
+    gram: Array, unexcited: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_], float]:
+    scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
+    eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+    half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
+    undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
+    condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
+    return half @ half.T, undetermined, condition_number
