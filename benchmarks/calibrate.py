@@ -33,7 +33,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -162,7 +162,7 @@ def judged(at: RecordEvaluation, tolerance: Tolerance, phi: Array) -> dict[str, 
 
 def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
     """Figures of one motion."""
-    tolerance, t = read_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
+    tolerance, t = parse_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
     motion = excited(t) if name == "excite" else None
     stops: list[dict[str, Any]] = []
     first: list[dict[str, Any]] = []

@@ -130,7 +130,7 @@ def study(
         F, measured, commanded = record(level, seed)
         for name, estimator in estimators(level).items():
             extra = [commanded] if name == "RIV" else []
-            estimator.learn(F, *measured, *extra)
+            estimator.update_samples(F, *measured, *extra)
             found = np.concatenate([estimator.offsets, estimator.phi])
             errors.setdefault(name, []).append(found - TRUTH)
         for method in batch:
@@ -195,7 +195,7 @@ def times(repetitions: int = 15) -> dict[str, float]:
         for name, estimator in estimators("JR3").items():
             extra = [commanded] if name == "RIV" else []
             start = time.thread_time()
-            estimator.learn(F, *measured, *extra)
+            estimator.update_samples(F, *measured, *extra)
             took[name] = (time.thread_time() - start) / len(F) * 1e6
         best = {name: min(t, best.get(name, t)) for name, t in took.items()}
     return best

@@ -146,13 +146,13 @@ def recursive_update() -> dict[str, float]:
 
     def compiled(count: int = n) -> Array:
         estimator = RecursiveLeastSquares(NOISE)
-        estimator.learn(wrench[:count], s[:count], omega[:count], alpha[:count])
+        estimator.update_samples(wrench[:count], s[:count], omega[:count], alpha[:count])
         return np.concatenate([estimator.offsets, estimator.phi])
 
     def total() -> None:
         # Noise of s, omega and alpha; what it is makes no difference to the time.
         motion_std = np.repeat([0.05, 0.002, 1.0], 3)
-        RecursiveTotalLeastSquares(NOISE, motion_std).learn(wrench, s, omega, alpha)
+        RecursiveTotalLeastSquares(NOISE, motion_std).update_samples(wrench, s, omega, alpha)
 
     def python() -> Array:
         estimator = RecursiveLeastSquares(NOISE)

@@ -31,7 +31,7 @@ from drake_teleop.load.online.recursive_tls import (
     residual_products,
     solve_linear_system,
     weighted_gram,
-    weighted_right,
+    weighted_right_side,
     write_products_vector,
 )
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
@@ -68,7 +68,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
     invert_matrix(S, inverse, W)
     weighted_gram(instruments, W, index, factors, E, MRg, 0)
     weighted_gram(mixed, W, index, factors, E, MRg, 16)
-    weighted_right(mixed[:, 13:].T, W, index, factors, g)
+    weighted_right_side(mixed[:, 13:].T, W, index, factors, g)
     for i in range(16):
         MRg[i, 32] = g[i]
         MRg[i, i] += _RIDGE * MRg[i, i] + information[i]
@@ -112,7 +112,7 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):
-    """Recursive instrumental variables; `learn` requires instruments."""
+    """Recursive instrumental variables; `update_samples` requires instruments."""
 
     method = "recursive instrumental variables"
 
@@ -129,7 +129,7 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         riv_normal_equations(memory, theta, *options, allocate_scratch(), MRg, A)
         return self._limit_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
 
-    def learn(
+    def update_samples(
         self,
         wrench: ArrayLike,
         s: ArrayLike,
@@ -140,9 +140,9 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         """Update by N samples; instruments (N, 9) are [s; omega; alpha] from a second source."""
         motion = {"s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
         _, rows = broadcast_to_rows(wrench=(wrench, 6), **motion, instruments=(instruments, 9))
-        self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
+        self._update_state(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
-    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+    def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._forgetting, 1.0 / self._prior, *nonzero_regressor_terms())
         riv_update(theta, memory, samples, *options)

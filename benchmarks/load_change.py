@@ -213,11 +213,13 @@ def times(repetitions: int = 7) -> dict[str, float]:
             if name == "disturbed":
                 rows[0][:, 0] += 30.0
             learner = monitor("JR3", load)
-            learn = learner.watch
+            update_samples = learner.watch
             if name == "recursive least squares":
-                learn = RecursiveLeastSquares(np.repeat(SENSORS["JR3"][0], 3)).learn
+                update_samples = RecursiveLeastSquares(
+                    np.repeat(SENSORS["JR3"][0], 3)
+                ).update_samples
             start = time.thread_time()
-            learn(*rows)
+            update_samples(*rows)
             took = (time.thread_time() - start) / len(rows[0]) * 1e6
             best[name] = min(took, best.get(name, took))
     return best

@@ -43,7 +43,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
+from drake_teleop.load.tolerance import parse_tolerance, required_values, tolerances_in_units
 from drake_teleop.logs.processing import identify_log, usable_phi
 from drake_teleop.logs.read.alignment import choose_delay, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log, write_log
@@ -52,7 +52,7 @@ from drake_teleop.robots.calibration import evaluate_record
 
 Array = NDArray[np.float64]
 
-ASKED = read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %")
+ASKED = parse_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %")
 SECONDS, POSES = 10.0, 20
 WORDS = ("mass_%", "com_mm", "inertia_%", "physical", "left_N", "left_N_m")
 PEERS = ("ours", "least squares", "kth", "ours at rest", "static", "vendor")

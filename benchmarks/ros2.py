@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -163,7 +163,7 @@ class Tables:
 
     def judged(self, found: Identification) -> NDArray[np.bool_]:
         """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
-        tolerance = read_tolerance(UNTIL)
+        tolerance = parse_tolerance(UNTIL)
         half, wide, _ = half_widths_over_tolerances(
             SimpleNamespace(identification=found), tolerance
         )  # type: ignore[arg-type]
@@ -195,7 +195,7 @@ def calibrations(folder: Path, loads: int) -> dict[str, float]:
             for name in recorder.file_names:
                 (folder / name).unlink(missing_ok=True)
             looks = calibrate(
-                stream, recorder, folder / recorder.log_file_name, read_tolerance(UNTIL)
+                stream, recorder, folder / recorder.log_file_name, parse_tolerance(UNTIL)
             )
             stream.close()
             last = looks[-1]

@@ -30,7 +30,7 @@ from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--restarts", type=int, default=20)
     parser.add_argument("--records", type=int, default=50)
     options = parser.parse_args()
-    scenario, tolerance = LoadScenario("identification"), read_tolerance(ASKED)
+    scenario, tolerance = LoadScenario("identification"), parse_tolerance(ASKED)
     robot, found = RobotFromScenario(scenario), []
     for seed in range(options.restarts):
         found.append(design_shortest_motion(robot, tolerance, seed=seed).excitation)

@@ -443,7 +443,7 @@ def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_log
     rows = instants(finely_logged, 500.0)
     rows = rows[log.t[rows] < 0.99 * SAMPLES_PER_NOISE_BLOCK * period]
     names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
-    estimator.learn(log["measured_wrench_S"][rows], *(log[name][rows] for name in names))
+    estimator.update_samples(log["measured_wrench_S"][rows], *(log[name][rows] for name in names))
     expected = np.concatenate([estimator.offsets, estimator.phi])
     np.testing.assert_allclose(log["load_estimate"][rows[-1] + 1], expected, rtol=1e-9, atol=1e-12)
     assert np.abs(expected).min() > 0.0 and len(rows) > 10

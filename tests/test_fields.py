@@ -44,7 +44,7 @@ def test_every_field_has_a_meaning(root: type) -> None:
 
 def test_a_quantity_has_unit_and_range() -> None:
     duration = named(Simulation, "duration")
-    assert (duration.kind, duration.lists, duration.optional) == ("number", 0, False)
+    assert (duration.kind, duration.list_depth, duration.optional) == ("number", 0, False)
     assert (duration.unit, duration.default, duration.range) == ("s", 1.0, "0.001 to 36000 s")
     assert named(ForceScalingConfig, "sigma").range == "0 to 100"  # no unit
     assert named(Simulation, "integrator").range.startswith("runge_kutta3, ")
@@ -52,10 +52,15 @@ def test_a_quantity_has_unit_and_range() -> None:
 
 def test_lists_blocks_and_optional_fields() -> None:
     intent, task = named(OperatorConfig, "intent"), named(OperatorConfig, "task")
-    assert (intent.kind, intent.lists, intent.range) == ("block", 1, "MinimumJerk or Sine")
-    assert (task.blocks, task.lists, task.optional, task.default) == (TASK_CLASSES, 0, True, None)
+    assert (intent.kind, intent.list_depth, intent.range) == ("block", 1, "MinimumJerk or Sine")
+    assert (task.blocks, task.list_depth, task.optional, task.default) == (
+        TASK_CLASSES,
+        0,
+        True,
+        None,
+    )
     vectors = named(Factor, "vectors")
-    assert (vectors.kind, vectors.lists, vectors.length) == ("number", 2, None)
+    assert (vectors.kind, vectors.list_depth, vectors.length) == ("number", 2, None)
     assert named(ForceScalingConfig, "eta").optional
 
 

@@ -32,7 +32,7 @@ INERTIA = np.array([[0.05, 0.01, -0.02], [0.01, 0.06, 0.003], [-0.02, 0.003, 0.0
         (vectors.cross, (a, b), np.cross(a, b)),
         (vectors.add_cross_product, (c, a, b), c + np.cross(a, b)),
         (vectors.apply_matrix, (R.ravel(), a), R @ a),
-        (vectors.symmetric_at, (phi, 4), INERTIA.ravel()),
+        (vectors.symmetric_matrix_at, (phi, 4), INERTIA.ravel()),
     ],
 )
 def test_vector_functions_equal_numpy(function, arguments, expected, compiled):

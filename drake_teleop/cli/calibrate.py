@@ -19,7 +19,7 @@ from drake_teleop.load.tolerance import (
     QUANTITY_NAMES,
     QUANTITY_UNITS,
     Tolerance,
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -45,7 +45,7 @@ def calibrate_command(
 
     `until` is the required accuracy of the load, `largest` the range of the sensor: [N, N m].
     """
-    tolerance = read_tolerance(until)
+    tolerance = parse_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
     stream, recorder = open_source_and_recorder(source, limits, **stream_options)
@@ -68,10 +68,10 @@ def calibrate_command(
     write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
-        "known": dict(zip(tolerance.required_entries, last.is_known.tolist(), strict=True)),
+        "known": dict(zip(tolerance.required_entry_names, last.is_known.tolist(), strict=True)),
         "all_known": bool(last.is_known.all()),
         "half_widths_95": dict(
-            zip(tolerance.required_entries, last.relative_half_widths.tolist(), strict=True)
+            zip(tolerance.required_entry_names, last.relative_half_widths.tolist(), strict=True)
         ),
         "doubts": list(last.doubts),
         "advice": last.advice,
@@ -97,14 +97,14 @@ def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
     units = [
         QUANTITY_UNITS[name]
         for name in QUANTITY_NAMES
-        for entry in tolerance.required_entries
+        for entry in tolerance.required_entry_names
         if name in entry
     ]
     values = sizes = np.full(len(units), np.nan)
     if at.identified_log is not None:
         phi = at.identified_log.identification.phi
         values, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
-    for k, entry in enumerate(tolerance.required_entries):
+    for k, entry in enumerate(tolerance.required_entry_names):
         half = at.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
@@ -141,7 +141,7 @@ def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure
         axes = figure.subplots()
         t = np.array([at.record_length_s for at in looks])
         halves = np.array([at.relative_half_widths for at in looks])
-        for k, entry in enumerate(tolerance.required_entries):
+        for k, entry in enumerate(tolerance.required_entry_names):
             style = ("-", "--")[k // len(COLOURS) % 2]
             finite = np.isfinite(halves[:, k])
             colour = COLOURS[k % len(COLOURS)]

@@ -25,7 +25,7 @@ from drake_teleop.lab.excitation.motion_film import write_motion_film
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import read_tolerance
+from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def excite_command(
         until: required accuracy of the load; replaces criterion, period and seconds.
         quiet: True hides progress bars and tables; `progress` False hides only the bars.
     """
-    tolerance = None if until is None else read_tolerance(until)
+    tolerance = None if until is None else parse_tolerance(until)
     setup = LoadScenario(scenario)
     make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
@@ -118,7 +118,7 @@ def excite_command(
             )
             report(1.0)
             found = result.excitation
-            shares = dict(zip(tolerance.required_entries, result.reached.tolist(), strict=True))
+            shares = dict(zip(tolerance.required_entry_names, result.reached.tolist(), strict=True))
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}

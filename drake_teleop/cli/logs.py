@@ -16,14 +16,14 @@ from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
-    common_figures,
-    contact_figures,
-    figures_of_object_alone,
-    figures_of_record_part,
-    load_figures,
     notes_on_object_alone,
-    rms_figures,
     share_above_force,
+    summarize_detected_contact,
+    summarize_load,
+    summarize_log,
+    summarize_object_alone,
+    summarize_record_part,
+    summarize_wrenches,
     to_plain_values,
 )
 from drake_teleop.logs.processing import (
@@ -54,12 +54,12 @@ def identify_command(
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else load_of_object(result, gripper_load)
-    summary = common_figures(log, found, cutoff_hz, result.delay_s) | {
+    summary = summarize_log(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
-        **load_figures(result),
+        **summarize_load(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
-        "determined": found.base.text_lines(),
+        "determined": found.base_parameters.text_lines(),
         "method": result.method,
         "rejected": found.rejected.mean(),
         "condition_number": result.condition_number,
@@ -67,10 +67,10 @@ def identify_command(
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "causes": [asdict(cause) for cause in found.causes],
-        "loads": [figures_of_record_part(stretch) for stretch in found.loads],
+        "loads": [summarize_record_part(stretch) for stretch in found.loads],
     }
     if alone is not None:
-        summary |= {"gripper": str(gripper), "object": figures_of_object_alone(alone)}
+        summary |= {"gripper": str(gripper), "object": summarize_object_alone(alone)}
         summary["notes"] += notes_on_object_alone(alone)
     summary = to_plain_values(summary)
     from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
@@ -128,7 +128,7 @@ def eliminate_command(
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
-    summary = common_figures(log, found, cutoff_hz, found.delay_s) | {
+    summary = summarize_log(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
         **scales,
@@ -138,10 +138,10 @@ def eliminate_command(
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
     }
-    if found.point_mass:
+    if found.point_mass_inertias:
         summary["notes"].append(
-            f"{', '.join(found.point_mass)} of the load file are not identifiable: those of a point"
-            " mass are used"
+            f"{', '.join(found.point_mass_inertias)} of the load file are not identifiable: those"
+            " of a point mass are used"
         )
     if found.tare_fraction < 0.5:
         summary["notes"].append(
@@ -152,7 +152,9 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
-    summary = to_plain_values(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
+    summary = to_plain_values(
+        summary | summarize_wrenches(found) | summarize_detected_contact(found, causal_tare_s)
+    )
     from drake_teleop.logs.pictures import draw_elimination
 
     with output_folder(out):
@@ -193,7 +195,7 @@ def detect_command(
     """Detect contact in a log, write statistics and contact flags, return the summary."""
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated
-    summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {
+    summary = summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
         "load": None if load is None else str(load),
         "free": None if free is None else str(free),
         "free_s": found.free_s,

@@ -164,22 +164,22 @@ def _field_names(schema: type) -> list[str]:
 class FieldType(NamedTuple):
     """Structure of a field's type: `list[A | B] | None` is (1, (A, B), True).
 
-    With `by_name` the type is a mapping of names to items, `dict[str, A]`.
+    With `is_mapping` the type is a mapping of names to items, `dict[str, A]`.
     """
 
-    lists: int
+    list_depth: int
     items: tuple[Any, ...]
     optional: bool
-    by_name: bool = False
+    is_mapping: bool = False
 
 
 @functools.cache
 def field_type_of(hint: Any) -> FieldType:
     if typing.get_origin(hint) is list:
         inner = field_type_of(typing.get_args(hint)[0])
-        return FieldType(inner.lists + 1, inner.items, False)
+        return FieldType(inner.list_depth + 1, inner.items, False)
     if typing.get_origin(hint) is dict:
-        return FieldType(0, field_type_of(typing.get_args(hint)[1]).items, False, by_name=True)
+        return FieldType(0, field_type_of(typing.get_args(hint)[1]).items, False, is_mapping=True)
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return FieldType(0, (hint,), False)
     options = tuple(option for option in typing.get_args(hint) if option is not type(None))
@@ -191,16 +191,16 @@ def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> 
     first = kind.items[0]
     if value is None and kind.optional:
         return
-    if kind.by_name:
+    if kind.is_mapping:
         if not isinstance(value, dict) or "_tag" in value:
             raise _type_error("a mapping of names", value, place, "write {name: value}")
         for name, item in value.items():
-            inner = kind._replace(by_name=False)
+            inner = kind._replace(is_mapping=False)
             _check_type(inner, item, f"{place}.{name}", from_file=from_file)
-    elif kind.lists:
+    elif kind.list_depth:
         if not isinstance(value, list):
             raise _type_error("a list", value, place, "write it in brackets: [...]")
-        inner = FieldType(kind.lists - 1, kind.items, False)
+        inner = FieldType(kind.list_depth - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
     elif first in TYPE_NAMES:
@@ -258,8 +258,8 @@ class FieldInfo:
     Attributes:
         kind: "number", "whole number", "true or false", "word" or "block" (a dataclass), of the
             innermost items.
-        lists: number of nested lists, 0 for one value.
-        by_name: whether the value is a mapping of names to items.
+        list_depth: number of nested lists, 0 for one value.
+        is_mapping: whether the value is a mapping of names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
         low, high: range of a quantity, limits included.
         choices: the allowed words; empty if all are allowed.
@@ -268,7 +268,7 @@ class FieldInfo:
 
     name: str
     kind: str
-    lists: int
+    list_depth: int
     length: int | None
     optional: bool
     default: Any
@@ -278,7 +278,7 @@ class FieldInfo:
     choices: tuple[str, ...]
     blocks: tuple[type, ...]
     meaning: str
-    by_name: bool = False
+    is_mapping: bool = False
 
     @property
     def range(self) -> str:
@@ -356,13 +356,13 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 
 def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
-    lists, items, optional, by_name = _type_of_field(entry, entry.type)
+    lists, items, optional, is_mapping = _type_of_field(entry, entry.type)
     blocks = tuple(item for item in items if item not in TYPE_NAMES)
     metadata = entry.metadata
     return FieldInfo(
         name=entry.name,
         kind="block" if blocks else TYPE_NAMES[items[0]].removeprefix("a "),
-        lists=lists,
+        list_depth=lists,
         length=metadata.get("length"),
         optional=optional,
         default=_default_value(entry) if isinstance(config, type) else getattr(config, entry.name),
@@ -374,7 +374,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         else (),
         blocks=blocks,
         meaning=metadata.get("doc") or _first_docstring_line(blocks[0]),
-        by_name=by_name,
+        is_mapping=is_mapping,
     )
 
 

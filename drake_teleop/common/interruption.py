@@ -27,7 +27,7 @@ def install_handlers() -> None:
 
 
 @contextmanager
-def handled_sigint() -> Iterator[None]:
+def handle_sigint() -> Iterator[None]:
     """Handle SIGINT as `install_handlers` does, in this context and only instead of Python."""
     before = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()

@@ -77,7 +77,7 @@ def to_float(name: str, value: Any) -> float:
         ) from None
 
 
-def check_identified(name: str, phi: Array) -> Array:
+def check_nonzero_load(name: str, phi: Array) -> Array:
     if not phi.any():
         raise DrakeTeleopError(
             "is zero, so this load is not identified",

@@ -77,10 +77,8 @@ def _check_column(
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
     _require_undamaged(rows in (None, values), f"{name} has {values} values in {rows} rows")
-    largest, length = (
-        _read_size(column, 6, f"bytes in {name}"),
-        _read_size(column, 7, f"bytes in {name}"),
-    )
+    largest = _read_size(column, 6, f"bytes in {name}")
+    length = _read_size(column, 7, f"bytes in {name}")
     at = _read_size(column, 9, f"the first byte of {name}")
     at = min(at, _read_size(column, 11, f"the first byte of {name}", 0) or at)
     _require_undamaged(at + length <= end, f"{name} goes beyond the end of the file")

@@ -41,12 +41,15 @@ def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Arr
     if form == "matrix":
         return columns.reshape(-1, 3, 3)
     if form == "rotation_vector":
-        return _matrices_from_quaternions(_quaternions_from_vectors(columns))
+        half = np.linalg.norm(columns, axis=1, keepdims=True) / 2
+        # np.sinc(x) = sin(pi x) / (pi x) avoids a division by zero at angle 0.
+        vectors = 0.5 * np.sinc(half / np.pi) * columns
+        return _matrices_from_quaternions(np.hstack([np.cos(half), vectors]))
     q = columns if form == "quaternion_wxyz" else np.roll(columns, 1, axis=1)
     return _matrices_from_quaternions(q)
 
 
-def rotation_error(R: Array) -> Array:
+def orthogonality_error(R: Array) -> Array:
     """Return max |R^T R - I| of matrices (..., 3, 3); at least 2 for reflections."""
     error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(R) < 0, np.maximum(error, 2.0), error)
@@ -60,7 +63,7 @@ def nearest_rotation(R: Array) -> Array:
     return R
 
 
-def quaternions_of(R: Array) -> Array:
+def quaternions_from_matrices(R: Array) -> Array:
     """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
     from scipy.spatial.transform import Rotation
 
@@ -77,12 +80,6 @@ def _matrices_from_quaternions(q: Array) -> Array:
         ],
         axis=-1,
     ).reshape(-1, 3, 3)
-
-
-def _quaternions_from_vectors(vectors: Array) -> Array:
-    half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
-    # np.sinc(x) = sin(pi x) / (pi x) avoids a division by zero at angle 0.
-    return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors])
 
 
 def signed_permutations() -> list[Array]:

@@ -102,7 +102,7 @@ def to_yaml_text(
     `head` are comment lines at the top; `comments` are texts after fields, by "field.inner".
     """
     lines, place, left = [f"# {to_one_line(text)}" for text in head], list[str](), comments or {}
-    for line in format_yaml(data, flow=None).splitlines():
+    for line in format_yaml_value(data, flow=None).splitlines():
         inner = line.lstrip(" ")
         place[(len(line) - len(inner)) // 2 :] = [inner.partition(":")[0]]
         comment = left.get(".".join(place), "")
@@ -117,7 +117,7 @@ def to_yaml_text(
     return text
 
 
-def format_yaml(value: Any, flow: bool | None = True) -> str:
+def format_yaml_value(value: Any, flow: bool | None = True) -> str:
     """Return a value as YAML in one line; with `flow` None, blocks have their own lines."""
     text: str = yaml.dump(
         value,

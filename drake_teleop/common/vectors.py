@@ -97,7 +97,7 @@ def apply_matrix(R, a):
 
 
 @register_jitable
-def symmetric_at(x, i):
+def symmetric_matrix_at(x, i):
     """Return the symmetric matrix (9 numbers) of xx, xy, xz, yy, yz, zz from index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.numeric import Array, check_identified, contact_spans
+from drake_teleop.common.numeric import Array, check_nonzero_load, contact_spans
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     quaternion_logarithm,
@@ -55,7 +55,7 @@ def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 def calculated_contact_wrench(result: SimulationResult) -> Array:
     """Return the contact wrench (N, 6) [N, N m] in S with the final load estimate."""
     estimate = result["load_estimate"][-1]
-    check_identified("load_estimate", estimate[6:])
+    check_nonzero_load("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
     return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
 

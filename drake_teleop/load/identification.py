@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import write_json
-from drake_teleop.common.numeric import Array, check_identified, finite_array
+from drake_teleop.common.numeric import Array, check_nonzero_load, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
 VERDICT_NAMES = ("identified", "weakly", "not", "prior")
@@ -66,7 +66,7 @@ class Identification:
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     def __post_init__(self) -> None:
-        check_identified("phi", finite_array("phi", self.phi, 10))
+        check_nonzero_load("phi", finite_array("phi", self.phi, 10))
         finite_array("offsets", self.offsets, 6)
 
     @property
@@ -110,10 +110,8 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        deviations, named = (
-            self.standard_deviations,
-            zip(PARAMETER_NAMES, self.verdicts, strict=True),
-        )
+        deviations = self.standard_deviations
+        named = zip(PARAMETER_NAMES, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
         force, torque = (np.linalg.norm(part) for part in np.split(self.residual_rms, 2))
@@ -190,7 +188,9 @@ class Identification:
         optional = {
             k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
         }
-        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_FILE_VALUE))
+        phi = check_nonzero_load(
+            f"{path}:phi", read_number_array("phi", 10, largest=_MAX_FILE_VALUE)
+        )
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise _file_error("has the mass 0", f"{path}:phi")
         result = cls(

@@ -116,19 +116,10 @@ class SecondMoments:
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
         products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
-        jacobian = np.zeros((3, 3, 19))  # derivative of z by w_k, coefficient of w_i
-        for i in range(3):
-            for j in range(3):
-                jacobian[j, i, _OMEGA_PRODUCT_INDICES[i, j]] += 1.0 + (i == j)
-        for k in range(3):
-            Q += noise.motion[1, k] ** 2 * jacobian[k].T @ products @ jacobian[k]
-        return Q
-
-    @staticmethod
-    def walk_covariance(noise: NoiseStd) -> Array:
-        """Return the covariance (19, 19) of a random-walk step of z, Eq. (T4)."""
-        Q = np.zeros((19, 19))
-        Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
+        for std, J in zip(
+            noise.motion[1], omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19), strict=True
+        ):
+            Q += std**2 * J.T @ products @ J
         return Q
 
 
@@ -145,6 +136,18 @@ def regressor_coefficients() -> Array:
         T[:, 6:, 16 + k] = both - regressor(zero, unit[[i, j]], zero).sum(axis=0)
     T.flags.writeable = False
     return T
+
+
+def omega_product_jacobians(indices: NDArray[np.intp], size: int) -> Array:
+    """Return derivatives (3, 3, size) of products w_i w_j by w_k, as coefficients of w_i.
+
+    `indices` (3, 3) are the positions of the products in a vector of this size.
+    """
+    jacobians = np.zeros((3, 3, size))
+    for i in range(3):
+        for j in range(3):
+            jacobians[j, i, indices[i, j]] += 1.0 + (i == j)
+    return jacobians
 
 
 def centripetal_matrix(r: Array) -> Array:

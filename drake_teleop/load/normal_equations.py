@@ -22,10 +22,10 @@ from drake_teleop.load.moments import (
 _MIN_EIGENVALUE, _MAX_NULL_COMPONENT = 1e-12, 1e-6
 # Smallest block length over the noise's correlation time, fewest degrees of freedom of a usable
 # variance.
-_MIN_CORRELATION_TIMES, _MIN_DEGREES = 4.0, 8.0
+_MIN_CORRELATION_TIMES, _MIN_DEGREES_OF_FREEDOM = 4.0, 8.0
 # For noise that is weaker at low frequencies: fewest degrees of freedom, and smallest share of the
 # fit's degrees of freedom that the blocks contain.
-_MIN_DEGREES_LONGEST, _MIN_ABSORBED_SHARE = 20.0, 0.9
+_MIN_DEGREES_OF_LONGEST_BLOCKS, _MIN_ABSORBED_SHARE = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
@@ -94,7 +94,7 @@ class NormalEquations(SecondMoments):
         )
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
-        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_directions)
+        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_columns)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
         weights = self._weights if weights is None else finite_array("weights", weights, 6)
@@ -105,12 +105,8 @@ class NormalEquations(SecondMoments):
         return np.asarray(T @ self._sums @ T.transpose(0, 2, 1))
 
     @property
-    def unexcited_directions(self) -> NDArray[np.bool_]:
+    def unexcited_columns(self) -> NDArray[np.bool_]:
         return ~excited_columns(self.mean_products)
-
-    @property
-    def channel_weights(self) -> Array:
-        return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
         squares = np.diag(residual_covariance(self._sums, finite_array("theta", theta, 16)))
@@ -145,14 +141,14 @@ class NormalEquations(SecondMoments):
         last, length, filled = (int(number) for number in self._state)
         # An unfinished last block would have the weight of a full one.
         blocks = self._blocks[: last + (filled == length)]
-        while len(blocks) > _MIN_DEGREES:
+        while len(blocks) > _MIN_DEGREES_OF_FREEDOM:
             rows = _regressors_of_blocks(blocks)
             power = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
             estimated, counted = self._unbiased_variances(
                 power, len(blocks), between, grams, inverse
             )
-            usable = ~found & (counted >= _MIN_DEGREES)
+            usable = ~found & (counted >= _MIN_DEGREES_OF_FREEDOM)
             correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
             at_borders = np.minimum(correlation / (2.0 * length), 0.5 / _MIN_CORRELATION_TIMES)
             corrected = estimated / (1.0 - np.where(correlation > 1.5, at_borders, 0.0))
@@ -166,7 +162,7 @@ class NormalEquations(SecondMoments):
                 self._absorbed_degrees_of_freedom(between, inverse)
                 >= _MIN_ABSORBED_SHARE * sample_absorbed
             )
-            is_longest = has_motion & (counted >= _MIN_DEGREES_LONGEST)
+            is_longest = has_motion & (counted >= _MIN_DEGREES_OF_LONGEST_BLOCKS)
             longest = np.where(is_longest, estimated, longest)
             longest_degrees = np.where(is_longest, counted, longest_degrees)
             significant = correlation > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(counted, 1.0))

@@ -19,7 +19,7 @@ from drake_teleop.common.vectors import (
     cross,
     plus,
     scale_vector,
-    symmetric_at,
+    symmetric_matrix_at,
     vector_at,
 )
 
@@ -64,7 +64,7 @@ def regressor_into(s, omega, alpha, V):
 def wrench_of_load(s, omega, alpha, phi):
     """Return the force and the torque of V phi as tuples, for scalars of any type."""
     s, omega, alpha = vector_at(s, 0), vector_at(omega, 0), vector_at(alpha, 0)
-    m, h, inertia = phi[0], vector_at(phi, 1), symmetric_at(phi, 4)  # h = m c
+    m, h, inertia = phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)  # h = m c
     force = plus(plus(scale_vector(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
     torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
     return force, plus(torque, cross(h, s))

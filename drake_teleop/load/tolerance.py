@@ -13,7 +13,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITY_NAMES = ("mass", "com", "inertia")
 """Names of the quantities whose accuracy a tolerance can require."""
-ENTRY_NAMES = {
+NAMES_OF_ENTRIES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
@@ -23,8 +23,8 @@ QUANTITY_UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
 """Unit of each quantity in printed values."""
 
 _SI_VALUE_OF_UNIT = {"%": 0.01, "mm": 1e-3, "m": 1.0}
-_ENTRY_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
-_MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
+_TOLERANCE_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
+_MIN_TOLERANCE, _MAX_TOLERANCE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
@@ -41,13 +41,15 @@ class Tolerance(NamedTuple):
     inertia: float | None = None
 
     @property
-    def required_quantities(self) -> tuple[str, ...]:
+    def required_quantity_names(self) -> tuple[str, ...]:
         return tuple(name for name in QUANTITY_NAMES if getattr(self, name) is not None)
 
     @property
-    def required_entries(self) -> tuple[str, ...]:
+    def required_entry_names(self) -> tuple[str, ...]:
         """Names (k,) of the required numbers, such as "com x"."""
-        return tuple(entry for name in self.required_quantities for entry in ENTRY_NAMES[name])
+        return tuple(
+            entry for name in self.required_quantity_names for entry in NAMES_OF_ENTRIES[name]
+        )
 
     def __str__(self) -> str:
         return ", ".join(
@@ -57,10 +59,10 @@ class Tolerance(NamedTuple):
         )
 
 
-def read_tolerance(text: str) -> Tolerance:
+def parse_tolerance(text: str) -> Tolerance:
     found: dict[str, float] = {}
     for part in text.split(","):
-        match = _ENTRY_PATTERN.fullmatch(part)
+        match = _TOLERANCE_PATTERN.fullmatch(part)
         name, unit = (match[1], match[3]) if match else ("", "")
         try:
             value = float(match[2]) * _SI_VALUE_OF_UNIT[unit] if match else 0.0
@@ -72,7 +74,7 @@ def read_tolerance(text: str) -> Tolerance:
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
-        if not _MIN_VALUE <= value <= _MAX_VALUE:
+        if not _MIN_TOLERANCE <= value <= _MAX_TOLERANCE:
             raise DrakeTeleopError(
                 f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)",
                 where=text,
@@ -99,7 +101,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
     out, rows_of = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
-    for name in tolerance.required_quantities:
+    for name in tolerance.required_quantity_names:
         start, stop, size = rows_of[name]
         out.append(rows[start:stop] / (size * getattr(tolerance, name)))
     return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
@@ -118,12 +120,14 @@ def required_values(tolerance: Tolerance, phi: Array) -> Array:
     """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
-    return np.concatenate([values[name] for name in tolerance.required_quantities])
+    return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_units(tolerance: Tolerance, phi: Array) -> Array:
     """Return the tolerances (k,) of the required numbers for load phi (10,) [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
-    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantities]
-    return np.repeat(sizes, [len(ENTRY_NAMES[name]) for name in tolerance.required_quantities])
+    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantity_names]
+    return np.repeat(
+        sizes, [len(NAMES_OF_ENTRIES[name]) for name in tolerance.required_quantity_names]
+    )

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
-
-Array: TypeAlias = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 _FILE_FIELDS, _FIELDS_PER_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
 _MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]

@@ -18,7 +18,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     PoseMotion,
     estimate_from_poses,
-    motion_of_load,
+    fit_motion_to_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pass, remove_delay
@@ -26,18 +26,25 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
 _MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
-_EDGE_IN_KNOT_SPACINGS = 2.0
-_Motion = TypeVar("_Motion", bound=PoseMotion)
+_EDGE_OVER_KNOT_SPACING = 2.0
+_PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
 def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
-    return _fit_with_delay_or_usual(
-        log, delay, lambda late: _estimate_load_and_motion(log, late), 0.0, "undetermined"
-    )
+    posed = log.posed
+    assert posed is not None
+
+    def estimate_at_delay(late: float | None) -> PoseEstimate:
+        arrays = log.t, log.wrench, posed.poses, posed.gravity_W
+        return estimate_from_poses(
+            *arrays, delay=late, gain=log.gain_std, lost=log.bridged, imu=posed.imu
+        )
+
+    return _fit_with_usual_delay_if_undetermined(log, delay, estimate_at_delay, 0.0, "undetermined")
 
 
-def motion_of_known_load(
+def fit_motion_to_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
     """Return the motion from poses that fits an identified load best, and the delay's source.
@@ -51,40 +58,28 @@ def motion_of_known_load(
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
 
     def motion_at_delay(late: float | None) -> PoseMotion:
-        return motion_of_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
+        return fit_motion_to_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
 
     with suppress(DrakeTeleopError):  # too short
-        found, source = _fit_with_delay_or_usual(log, delay, motion_at_delay, usual_s, "load")
-        return (found, source) if found.imu_agrees else None
+        found, source = _fit_with_usual_delay_if_undetermined(
+            log, delay, motion_at_delay, usual_s, "load"
+        )
+        return (found, source) if found.is_imu_consistent else None
     return None
 
 
-def _fit_with_delay_or_usual(
+def _fit_with_usual_delay_if_undetermined(
     log: Log,
     delay: str | float,
-    motion: Callable[[float | None], _Motion],
+    motion: Callable[[float | None], _PoseMotionT],
     usual_s: float,
     usual: str,
-) -> tuple[_Motion, str]:
+) -> tuple[_PoseMotionT, str]:
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
-    if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
+    if known is None and not found.delay_deviation_s < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
-
-
-def _estimate_load_and_motion(log: Log, delay: float | None) -> PoseEstimate:
-    assert log.posed is not None
-    return estimate_from_poses(
-        log.t,
-        log.wrench,
-        log.posed.poses,
-        log.posed.gravity_W,
-        delay=delay,
-        gain=log.gain_std,
-        lost=log.bridged,
-        imu=log.posed.imu,
-    )
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
@@ -100,7 +95,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
         angular_acceleration=alpha,
         gravity=splines.gravity(t, gravity_W),
     )
-    stamps, margin = splines.poses.t, _EDGE_IN_KNOT_SPACINGS * splines.spacing
+    stamps, margin = splines.poses.t, _EDGE_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
     change = np.zeros(len(t) + 1)
@@ -111,13 +106,13 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
 
 def clock_rate_notes(found: PoseMotion) -> list[str]:
     """Return a note if the clock rate of the poses differs from that of the wrench."""
-    if not found.clock_rate:
+    if not found.clock_rate_error:
         return []
-    side = "faster" if found.clock_rate > 0.0 else "slower"
+    side = "faster" if found.clock_rate_error > 0.0 else "slower"
     return [
-        f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
+        f"the clock of the pose runs {1e6 * abs(found.clock_rate_error):.0f} millionths {side} than"
         " that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"
-        f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
+        f" default) by {1.0 / (1.0 + found.clock_rate_error):.6f}"
     ]
 
 
@@ -128,15 +123,15 @@ class AlignedLog:
     Attributes:
         log: with acceleration instead of specific force if the robot had removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
-        source: origin of the delay: "estimated", "given", "load" (identification file) or "static".
-        differentiated: log with motion by numerical differentiation, if required.
+        delay_source: "estimated", "given", "load" (identification file) or "static".
+        log_with_differentiated_motion: log with motion by numerical differentiation, if required.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
     """
 
     log: Log
     delay_s: float
-    source: str
-    differentiated: Log | None
+    delay_source: str
+    log_with_differentiated_motion: Log | None
     edge: NDArray[np.bool_]
 
 
@@ -159,28 +154,28 @@ def read_aligned_log(
     smooth = None
     coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
     with one_blas_thread():
-        found = motion_of_known_load(log, delay, coefficients, usual_s)
+        found = fit_motion_to_known_load(log, delay, coefficients, usual_s)
     if found is not None:
         motion, source = found
         moved, one_sided = use_spline_motion(log, motion)
         moved = replace(moved, notes=(*moved.notes, *clock_rate_notes(motion)))
         plain = remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
-            moved = replace_force_by_acceleration(moved)
-            plain = None if plain is None else replace_force_by_acceleration(plain)
+            moved = replace_specific_force_by_acceleration(moved)
+            plain = None if plain is None else replace_specific_force_by_acceleration(plain)
         edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    log = replace_force_by_acceleration(log) if weight_removed else log
+    log = replace_specific_force_by_acceleration(log) if weight_removed else log
     delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
     log = remove_delay(log, delay_s)
     other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
-    if smooth is None or _residual_spread(other, phi, cutoff_hz) < _residual_spread(
+    if smooth is None or _log_residual_spread(other, phi, cutoff_hz) < _log_residual_spread(
         smooth, phi, cutoff_hz
     ):
         return other
@@ -196,14 +191,14 @@ def missing_orientation_error(where: str) -> DrakeTeleopError:
     )
 
 
-def replace_force_by_acceleration(log: Log) -> Log:
+def replace_specific_force_by_acceleration(log: Log) -> Log:
     """Return the log with acceleration in place of specific force, by adding gravity."""
     if log.gravity is None:
         raise missing_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 
-def _residual_spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
+def _log_residual_spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
     return float(np.log(narrowest_half_interval(left[~aligned.edge])[0] + 1e-12).sum())

@@ -83,10 +83,10 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay of `causal_low_pass` for slow signals [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
-    return _ROOT_OF_2 / _prewarped_frequency(cutoff_hz, dt)
+    return _ROOT_OF_2 / (2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _ROOT_4_OF_3)
 
 
-def causal_wrenches(
+def compute_causal_wrench(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalWrench:
     """Return the filtered wrenches that a control loop has at each instant.
@@ -108,7 +108,3 @@ def causal_wrenches(
         return filtered[rows]
 
     return CausalWrench(mode, lag, filter_and_delay(contact), filter_and_delay(scaled))
-
-
-def _prewarped_frequency(cutoff_hz: float, dt: float) -> float:
-    return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _ROOT_4_OF_3

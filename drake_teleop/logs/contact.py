@@ -26,23 +26,23 @@ from drake_teleop.load.contact.noise_floor import (
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
-MIN_SAMPLES = 100
+MIN_NOISE_FLOOR_SAMPLES = 100
 """Fewest samples for a noise floor."""
 
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
-_GRAVITY_CUTOFF_HZ = 0.5
-_QUIET_DEVIATIONS = 4.0
+_MAX_GRAVITY_FREQUENCY_HZ = 0.5
+_MAX_QUIET_DEVIATIONS = 4.0
 _DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
-_BLOCK_S, _MIN_NUM_BLOCKS = 0.1, 20
+_BLOCK_DURATION_S, _MIN_NUM_BLOCKS = 0.1, 20
 _CONCENTRATION_STEPS, _NUM_FLOOR_ROUNDS = 4, 3
-_RECORD_MARGIN, _MIN_REACHED = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
+_RECORD_THRESHOLD_MARGIN, _MIN_REACHED_STATISTIC = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
 _MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
-_MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
+_MAX_CONTACT_SHARE, _MAX_FLOOR_OVER_RESIDUAL = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
-_MIN_CONTACT_SHARE_OF_SHIFT = 0.2
+_MIN_CONTACT_SHARE_FOR_SHIFT = 0.2
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> D
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
-        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_CUTOFF_HZ)
+        gravity = -low_pass(log.specific_force, log.dt, _MAX_GRAVITY_FREQUENCY_HZ)
     return DetectorSamples(contact, s, omega, alpha, s + gravity)
 
 
@@ -102,7 +102,7 @@ def detect_contact(
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
     inner = _select_judged_samples(rows, dt, period, edge)
     judged = rows.select_rows(inner)
-    if len(judged.contact) < MIN_SAMPLES:
+    if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
         return None
     hold = round(period / dt)
     # A held value decays by the factor e within a period.
@@ -150,15 +150,15 @@ def _fit_record_floor(
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
-    block = max(hold, round(_BLOCK_S / dt))
+    block = max(hold, round(_BLOCK_DURATION_S / dt))
     selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_FLOOR_SAMPLES) == 0
     quiet = _is_below_noise_limit(rows.contact, noise_floor(rows.contact))
-    if (quiet & selected).sum() < MIN_SAMPLES:
+    if (quiet & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
         quiet = selected = np.ones(n, bool)
     for _ in range(_CONCENTRATION_STEPS if n >= _MIN_NUM_BLOCKS * block else 0):
         floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
         half = _quieter_half_of_blocks(statistics_of_log(floor, *rows)[:, 0], block)
-        if (half & selected).sum() < MIN_SAMPLES:
+        if (half & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
             break
         quiet = half
     for attempt in range(_NUM_FLOOR_ROUNDS):
@@ -168,15 +168,17 @@ def _fit_record_floor(
         reached = _extrapolated_maximum(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
-        reached = max(_MIN_REACHED, reached)
+        reached = max(_MIN_REACHED_STATISTIC, reached)
         detector = ContactDetector(
             floor, THRESHOLD_MARGIN * reached, statistic=statistic, hold=hold
         )
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
-        if (selected & without_contact).sum() < MIN_SAMPLES or attempt == _NUM_FLOOR_ROUNDS - 1:
+        if (
+            selected & without_contact
+        ).sum() < MIN_NOISE_FLOOR_SAMPLES or attempt == _NUM_FLOOR_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _RECORD_MARGIN * reached, rows.select_rows(quiet)
+    return floor, _RECORD_THRESHOLD_MARGIN * reached, rows.select_rows(quiet)
 
 
 def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
@@ -221,7 +223,7 @@ def _detection_notes(
             f" determine the noise floor{remedy}",
         )
     noise_ratio = float((floor.noise / np.maximum(usual, _MIN_NOISE_FLOOR)).max())
-    if noise_ratio > _MAX_NOISE_RATIO:
+    if noise_ratio > _MAX_FLOOR_OVER_RESIDUAL:
         return (
             f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"
             " identification: most of the record may be in contact, which is not detected"
@@ -233,7 +235,7 @@ def _detection_notes(
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
-    if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_OF_SHIFT:
+    if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_SHIFT:
         return ()
     return (
         f"the offsets of the record differ by {force:.2g} N from those of the free motion: either"
@@ -273,7 +275,7 @@ def noise_floor(contact: Array) -> Array:
 
 
 def _is_below_noise_limit(contact: Array, floor: Array) -> NDArray[np.bool_]:
-    return np.asarray((np.abs(contact) <= _QUIET_DEVIATIONS * floor).all(axis=1))
+    return np.asarray((np.abs(contact) <= _MAX_QUIET_DEVIATIONS * floor).all(axis=1))
 
 
 def summarize_contacts(

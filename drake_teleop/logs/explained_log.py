@@ -31,12 +31,10 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
 _MAX_MASS_KG = 1000.0
-_SIGN_FIELD, _FRAME_FIELD, _WEIGHT_FIELD, _GRAVITY_FIELD = (
-    "wrench.sign",
-    "wrench.frame",
-    "wrench.weight",
-    "gravity",
-)
+_SIGN_FIELD = "wrench.sign"
+_FRAME_FIELD = "wrench.frame"
+_WEIGHT_FIELD = "wrench.weight"
+_GRAVITY_FIELD = "gravity"
 _FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD = "wrench.force.scale", "wrench.torque.scale"
 _FORCE_UNIT_FIELD, _TORQUE_UNIT_FIELD = "wrench.force.unit", "wrench.torque.unit"
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
@@ -74,7 +72,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{_note_for_table(log)}"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{note_for_table(log)}"
     )
 
 
@@ -99,11 +97,11 @@ def _correct_fields(
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{_note_for_table(log)}" if lines else otherwise)
+        texts.append(f"set {lines}{note_for_table(log)}" if lines else otherwise)
     return fields, texts, corrected
 
 
-def _note_for_table(log: Log) -> str:
+def note_for_table(log: Log) -> str:
     return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
@@ -181,10 +179,8 @@ def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -
 
 
 def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    force, torque = (
-        SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]],
-        SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]],
-    )
+    force = SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]]
+    torque = SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]]
     ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
     ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:
@@ -223,10 +219,10 @@ _CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], No
 }
 
 
-_MARGIN_IN_KNOTS = 2.0  # knots, at either end
+_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
 _MIN_ROWS = 100
-_MAX_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
-_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
+_MIN_WIDENING_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_BLOCK_MEAN_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
@@ -259,7 +255,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN_IN_KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _MARGIN_OVER_KNOT_SPACING * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
@@ -271,7 +267,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
-    f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
+    f = np.linspace(0.0, _BLOCK_MEAN_BANDWIDTH_HZ, 500)
     share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.remaining_noise_shares(f)[0]
@@ -301,7 +297,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)

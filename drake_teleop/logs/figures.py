@@ -23,7 +23,7 @@ from drake_teleop.logs.contact import noise_floor, summarize_contacts
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 
 
-def common_figures(
+def summarize_log(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
     log = found.log
@@ -41,7 +41,7 @@ def common_figures(
     }
 
 
-def figures_of_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
+def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -56,7 +56,7 @@ def figures_of_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
     }
 
 
-def load_figures(load: Identification) -> dict[str, Any]:
+def summarize_load(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
     ends = confidence_intervals(load)
     return {
@@ -69,15 +69,15 @@ def load_figures(load: Identification) -> dict[str, Any]:
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
         "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
-        "identifiable": _parameter_names(load, True),
-        "not_identifiable": _parameter_names(load, False),
+        "identifiable": _names_of_parameters(load, True),
+        "not_identifiable": _names_of_parameters(load, False),
         "physically_consistent": load.physically_consistent,
     }
 
 
-def figures_of_object_alone(alone: Identification) -> dict[str, Any]:
+def summarize_object_alone(alone: Identification) -> dict[str, Any]:
     margin, deviation = consistency_margin(alone)
-    figures = load_figures(alone)
+    figures = summarize_load(alone)
     for name in ("identifiable", "not_identifiable"):
         figures[name] = [entry for entry in figures[name] if entry in PARAMETER_NAMES[6:]]
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
@@ -101,12 +101,12 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _parameter_names(result: Identification, identifiable: bool) -> list[str]:
+def _names_of_parameters(result: Identification, identifiable: bool) -> list[str]:
     pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
 
-def rms_figures(found: EliminatedLog) -> dict[str, Any]:
+def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
     """Return RMS and peak values of the wrenches, without samples near ends and gaps."""
 
     def rms_over_samples(x: Array) -> Array:
@@ -117,19 +117,19 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
     inner, weightless = ~found.edge, found.gravity_only
     return (
-        _force_and_torque_figures("raw", "rms", found.measured[inner], rms_over_samples)
-        | _force_and_torque_figures(
+        _summarize_force_and_torque("raw", "rms", found.measured[inner], rms_over_samples)
+        | _summarize_force_and_torque(
             "gravity_only",
             "rms",
             None if weightless is None else weightless[inner],
             rms_over_samples,
         )
-        | _force_and_torque_figures("residual", "rms", found.contact[inner], rms_over_samples)
-        | _force_and_torque_figures("residual", "peak", found.contact[inner], peak_over_samples)
+        | _summarize_force_and_torque("residual", "rms", found.contact[inner], rms_over_samples)
+        | _summarize_force_and_torque("residual", "peak", found.contact[inner], peak_over_samples)
     )
 
 
-def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
+def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
@@ -176,7 +176,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     }
 
 
-def _force_and_torque_figures(
+def _summarize_force_and_torque(
     name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
 ) -> dict[str, Any]:
     keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")

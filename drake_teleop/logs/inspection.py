@@ -26,14 +26,14 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
 
-BANDWIDTH_HZ = 30.0
+GAP_BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
 MIN_REPEATED_BLOCK_ROWS = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
-_WRENCH_NAMES = {"f_x", "tau_x"}
+_CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
 _QUANTITY_NAMES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
@@ -53,7 +53,10 @@ def inspect_command(
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect_described_log(load_description(log), str(log), {}, summary)
-    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _WRENCH_NAMES:
+    elif (
+        not (others or is_bag(log))
+        and (table := read_table(log)).columns.keys() >= _CANONICAL_WRENCH_COLUMNS
+    ):
         summary["kind"] = "canonical"
         _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -72,7 +75,7 @@ def _describe_canonical(log: Path, table: Table) -> Description:
         return describe_canonical(log, table)
     except DrakeTeleopError:
         # A canonical log with NaN or a missing column gets the specific message.
-        return describe_canonical(log, _remove_nonfinite_rows(table, list(table.columns)))
+        return describe_canonical(log, _remove_nonfinite_rows(table))
 
 
 def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
@@ -270,7 +273,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length(median, BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length(median, GAP_BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
@@ -320,15 +323,11 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
 
 
-def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:
-    if len({len(table.raw(name, name)) for name in names}) != 1:
+def _remove_nonfinite_rows(table: Table) -> Table:
+    columns = [table.raw(name, name) for name in table.columns]
+    if len({len(x) for x in columns}) != 1:
         return table
-    good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
-    if good.all():
-        return table
-    rows = len(good)
-    kept = {n: x[good] if len(x) == rows else x for n, x in table.columns.items()}
-    return replace(table, columns=kept)
+    return _remove_rows(table, np.flatnonzero(~np.isfinite(np.hstack(columns)).all(axis=1)))
 
 
 def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:

@@ -31,7 +31,7 @@ from drake_teleop.load.identification import VERDICT_NAMES, Identification, natu
 from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedLog
 from drake_teleop.logs.read.canonical import Log
 
-_CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
+_CHANNEL_SYMBOLS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
 _PARAMETER_SYMBOLS = (
     *(rf"$f_{{o{a}}}$" for a in "xyz"),
     *(rf"$\tau_{{o{a}}}$" for a in "xyz"),
@@ -55,15 +55,59 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
     with plot_style():
         figure = Picture(figsize=(10, 7))
-        _draw_fit_into(figure, found)
+        log, result = found.log, found.identification
+        curves = [
+            ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
+            (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
+            ("residual", log.wrench - found.predicted, VERMILION),
+        ]
+        rms = np.asarray(result.residual_rms)
+        com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
+        title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
+        axes = _channel_axes(figure)
+        for i, axis in enumerate(axes):
+            _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
+            unit = "N" if i < 3 else "N m"
+            axis.set_title(f"{_CHANNEL_SYMBOLS[i]}: residual {rms[i]:.3g} {unit} rms")
+            if not log.static:
+                shade_contact(axis, log.t, found.rejected)
+        _add_labels_and_title(figure, axes, title, log, result.delay_s)
     return figure
 
 
 def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
-        figure = Picture(figsize=(10, 7.4))
-        _draw_intervals_into(figure, found)
+        figure: Any = Picture(figsize=(10, 7.4))
+        log, result = found.log, found.identification
+        residual = log.wrench - found.predicted
+        if log.static:
+            rate, shown = 1.0 + np.arange(len(log)), residual
+        else:
+            rate, shown = amplitude_spectral_densities(residual, log.dt)
+        spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
+        left, right = spectra.subplots(1, 2)
+        for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
+            curves = zip(
+                _CHANNEL_SYMBOLS[columns],
+                (BLUE, VERMILION, GREEN),
+                shown[:, columns].T,
+                strict=True,
+            )
+            for name, colour, values in curves:
+                if log.static:
+                    axis.plot(rate, values, "o", color=colour, label=name)
+                else:
+                    axis.loglog(rate, values, color=colour, label=name)
+            if log.static:
+                axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
+            else:
+                axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
+                # Frequencies above the cut-off do not show sensor noise.
+                top = axis.get_ylim()[1]
+                axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
+            axis.legend(ncols=3)
+        _draw_parameter_intervals(known, result)
     return figure
 
 
@@ -75,7 +119,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
         imsave(unfinished, np.concatenate([imread(upper), imread(lower)]), format="png")
 
 
-def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
+def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
     """Return frequencies (m,) [Hz] and one-sided amplitude spectral densities (m, k) of x (N, k).
 
     Welch's method. The densities are in unit of x / sqrt(Hz). Frequency 0 is omitted.
@@ -87,54 +131,7 @@ def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
     return rates[1:], np.sqrt(power[1:])
 
 
-def _draw_fit_into(figure: Any, found: IdentifiedLog) -> None:
-    log, result = found.log, found.identification
-    curves = [
-        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
-        (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
-        ("residual", log.wrench - found.predicted, VERMILION),
-    ]
-    rms = np.asarray(result.residual_rms)
-    com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
-    title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
-    axes = _channel_axes(figure)
-    for i, axis in enumerate(axes):
-        _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
-        unit = "N" if i < 3 else "N m"
-        axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
-        if not log.static:
-            shade_contact(axis, log.t, found.rejected)
-    _add_labels_and_title(figure, axes, title, log, result.delay_s)
-
-
-def _draw_intervals_into(figure: Any, found: IdentifiedLog) -> None:
-    log, result = found.log, found.identification
-    residual = log.wrench - found.predicted
-    if log.static:
-        rate, shown = 1.0 + np.arange(len(log)), residual
-    else:
-        rate, shown = spectrum(residual, log.dt)
-    spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
-    left, right = spectra.subplots(1, 2)
-    for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-        curves = zip(_CHANNELS[columns], (BLUE, VERMILION, GREEN), shown[:, columns].T, strict=True)
-        for name, colour, values in curves:
-            if log.static:
-                axis.plot(rate, values, "o", color=colour, label=name)
-            else:
-                axis.loglog(rate, values, color=colour, label=name)
-        if log.static:
-            axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
-        else:
-            axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
-            # Frequencies above the cut-off do not show sensor noise.
-            top = axis.get_ylim()[1]
-            axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
-        axis.legend(ncols=3)
-    _draw_parameters(known, result)
-
-
-def _draw_parameters(figure: Any, result: Identification) -> None:
+def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     natural = natural_scales(result.phi)
     theta = np.concatenate([result.offsets, result.phi]) / natural
     low, high = (end / natural for end in confidence_intervals(result))
@@ -201,7 +198,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         axes = _channel_axes(below)
         for i, axis in enumerate(axes):
             _draw_curves(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
-            axis.set_title(_CHANNELS[i])
+            axis.set_title(_CHANNEL_SYMBOLS[i])
             shade_contact(axis, t, touched)
         _add_labels_and_title(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
     return figure

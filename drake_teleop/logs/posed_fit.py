@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +20,20 @@ from drake_teleop.logs.aligned_log import (
 )
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
+from drake_teleop.logs.explained_log import note_for_table
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import YAML_ONLY_NOTE
-from drake_teleop.logs.read.table_files import TABLE_READERS
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
-_MIN_NOISE_SHARE = 1e-9
-# Fewest kept samples, and their rate over the cut-off of the low-pass.
-_MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
-_CHUNK, _FILTER_NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
+_MIN_NOISE_OVER_WRENCH = 1e-9
+# Fewest kept samples, and largest cut-off of the low-pass over their rate.
+_MIN_KEPT_SAMPLES, _CUTOFF_OVER_KEPT_RATE = 400_000, 0.25
+_CHUNK_SAMPLES, _FILTER_NEIGHBOURS = (
+    2**14,
+    2**8,
+)  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
@@ -41,17 +42,17 @@ class PosedFit:
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
+        delay_source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
     log: Log
     fit: BatchResult
     delay_s: float
-    source: str
+    delay_source: str
     motion: PoseEstimate
 
 
-def fit_posed(
+def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
@@ -64,8 +65,8 @@ def fit_posed(
     found, source = estimate_motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
-        rotated = found.frame.turned and not found.frame.shifted
-        if not found.imu_agrees or (finding is not None and not rotated):
+        rotated = found.frame.is_rotated and not found.frame.is_shifted
+        if not found.is_imu_consistent or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
@@ -78,8 +79,7 @@ def fit_posed(
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        if Path(log.source).suffix.lower() in TABLE_READERS:
-            finding = replace(finding, message=f"{finding.message} ({YAML_ONLY_NOTE})")
+        finding = replace(finding, message=f"{finding.message}{note_for_table(log)}")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
@@ -87,15 +87,16 @@ def fit_posed(
 def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
     stride = len(log) // _MIN_KEPT_SAMPLES
     if cutoff_hz is not None:
-        stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
+        stride = min(stride, int(_CUTOFF_OVER_KEPT_RATE / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
     few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
-    for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
-        before, stop = max(0, start - _FILTER_NEIGHBOURS), start + _CHUNK + _FILTER_NEIGHBOURS
+    for start in range(0, len(few), _CHUNK_SAMPLES):  # in chunks, to save memory
+        before = max(0, start - _FILTER_NEIGHBOURS)
+        stop = start + _CHUNK_SAMPLES + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
-        wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
+        wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
     bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
 
@@ -108,7 +109,7 @@ def _batch_result_of_estimate(
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_SHARE * size + 1e-30))
+    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_OVER_WRENCH * size + 1e-30))
     equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()

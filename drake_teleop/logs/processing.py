@@ -27,7 +27,7 @@ from drake_teleop.load.identification import PARAMETER_NAMES, Identification, lo
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import read_aligned_log
-from drake_teleop.logs.causal import CausalWrench, causal_wrenches
+from drake_teleop.logs.causal import CausalWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -38,7 +38,7 @@ from drake_teleop.logs.check.conventions import (
 )
 from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
 from drake_teleop.logs.contact import (
-    MIN_SAMPLES,
+    MIN_NOISE_FLOOR_SAMPLES,
     Detection,
     detect_contact,
     noise_floor,
@@ -54,7 +54,7 @@ from drake_teleop.logs.explained_log import (
     replace_frame_causes,
     unexplained_finding,
 )
-from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
+from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_load_to_posed_log
 from drake_teleop.logs.read.alignment import (
     choose_delay,
     far_from_gaps,
@@ -67,10 +67,10 @@ from drake_teleop.logs.read.reading import read_log
 
 _CAUSES_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_MAX_CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
+_MAX_CONSTANT_CHANNEL_CHANGE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _MIN_DELAY_DEVIATIONS = 5.0  # standard deviations
-_LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
+_MAX_SCALE = 100.0  # as in `ForceScalingConfig`
 _SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
@@ -83,7 +83,7 @@ class IdentifiedLog:
         predicted: (N, 6) wrench offsets + V phi of the load [N, N m].
         delay_source: origin of the delay, such as "estimated".
         rejected: (N,) True for samples that robust fits reject.
-        base: combinations of offsets and load that the samples determine.
+        base_parameters: combinations of offsets and load that the samples determine.
         findings: suspected errors of the log description.
         causes: effects beside a rigid load with constant offsets that the fit includes.
         loads: load of each part of the record, if it changes.
@@ -95,7 +95,7 @@ class IdentifiedLog:
     predicted: Array
     delay_source: str
     rejected: NDArray[np.bool_]
-    base: BaseParameters
+    base_parameters: BaseParameters
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
     loads: tuple[RecordPartWithLoad, ...] = ()
@@ -114,7 +114,7 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass: names of undetermined inertias, replaced by those of a point mass.
+        point_mass_inertias: names of undetermined inertias, replaced by those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -132,7 +132,7 @@ class EliminatedLog:
 
     log: Log
     phi: Array
-    point_mass: tuple[str, ...]
+    point_mass_inertias: tuple[str, ...]
     offsets: Array
     tare_fraction: float
     delay_s: float
@@ -181,10 +181,10 @@ def identify_log(
     METHODS.check(method, "method")
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
-        return _identify_read_log(path, method, cutoff_hz, delay, check)
+        return _read_and_identify_log(path, method, cutoff_hz, delay, check)
 
 
-def _identify_read_log(
+def _read_and_identify_log(
     path: str | Path,
     method: str,
     cutoff_hz: float | None,
@@ -192,12 +192,12 @@ def _identify_read_log(
     check: Callable[[], Conventions],
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
-    posed, other = fit_posed(log, method, cutoff_hz, delay)
+    posed, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     raw = log
     if posed is not None:
-        log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
+        log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.delay_source
     else:
         delay_s, source = choose_delay(log, cutoff_hz, delay)
         log = remove_delay(log, delay_s)
@@ -267,13 +267,13 @@ def _identify_read_log(
         findings,
         causes,
         loads,
-        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation,
+        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation_s,
     )
 
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
-    if log.static or (high - low <= _MAX_CONSTANT_SHARE * np.maximum(high, -low)).any():
+    if log.static or (high - low <= _MAX_CONSTANT_CHANNEL_CHANGE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -362,7 +362,7 @@ def eliminate_log(
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _check_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
+    scales = _checked_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -371,7 +371,7 @@ def eliminate_log(
         load_of_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
-        _eliminate_read_log,
+        _read_and_eliminate_log,
         identification=identification,
         phi_gripper=phi_gripper,
         scales=scales,
@@ -388,12 +388,7 @@ def eliminate_log(
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
-        source = (free_motion if free_motion.log.static else found).log.source
-        raise DrakeTeleopError(
-            "contains only poses at rest (`static`), in which no contact can be detected",
-            where=source,
-            remedy="give a log of a motion",
-        )
+        raise _static_log_error((free_motion if free_motion.log.static else found).log)
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
@@ -411,7 +406,15 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _eliminate_read_log(
+def _static_log_error(log: Log) -> DrakeTeleopError:
+    return DrakeTeleopError(
+        "contains only poses at rest (`static`), in which no contact can be detected",
+        where=log.source,
+        remedy="give a log of a motion",
+    )
+
+
+def _read_and_eliminate_log(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
@@ -441,7 +444,7 @@ def _eliminate_read_log(
         causal is not None,
         identification.weight_removed,
     )
-    log, delay_s, source = aligned.log, aligned.delay_s, aligned.source
+    log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
         raise DrakeTeleopError(
             "poses at rest have no times for a causal filter", where="causal", remedy="leave it out"
@@ -466,7 +469,7 @@ def _eliminate_read_log(
     motion = log.motion
     gravity_only = None
     removed = identification.weight_removed or "weight" in log.free
-    _check_gravity(log, removed, scales)
+    _require_gravity_for_scales(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
@@ -478,14 +481,15 @@ def _eliminate_read_log(
     scales = scales | {"gravity": log.gravity}
     scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
-    if causal is not None and aligned.differentiated is not None:
-        causal_offsets, motion = identification.offsets, aligned.differentiated.motion
+    if causal is not None and aligned.log_with_differentiated_motion is not None:
+        causal_offsets = identification.offsets
+        motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
             causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(
                 axis=0
             )
-        causal_wrench = causal_wrenches(
+        causal_wrench = compute_causal_wrench(
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
             scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
             log.dt,
@@ -503,7 +507,7 @@ def _eliminate_read_log(
     return EliminatedLog(
         log=log.select_rows(known),
         phi=phi,
-        point_mass=point_mass,
+        point_mass_inertias=point_mass,
         offsets=offsets,
         tare_fraction=fraction,
         delay_s=delay_s,
@@ -574,7 +578,7 @@ def weight_scale_error(where: str) -> DrakeTeleopError:
     )
 
 
-def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
+def _require_gravity_for_scales(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     sigmas = {name: value for name, value in scales.items() if name != "gamma"}
     weights, inertias = weight_and_inertia_scales(**sigmas)
     if weights == inertias:
@@ -587,7 +591,7 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
         )
 
 
-def _check_scales(
+def _checked_scales(
     sigma: float,
     sigma_object: float | None,
     gamma: float,
@@ -597,9 +601,9 @@ def _check_scales(
 ) -> dict[str, float | None]:
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
-        if value is not None and not 0.0 <= to_float(name, value) <= _LARGEST_SCALE:
+        if value is not None and not 0.0 <= to_float(name, value) <= _MAX_SCALE:
             raise DrakeTeleopError(
-                f"{value:g} is outside 0 to {_LARGEST_SCALE:g}",
+                f"{value:g} is outside 0 to {_MAX_SCALE:g}",
                 where=name,
                 remedy="give a scale, such as 0 or 1",
             )
@@ -655,15 +659,11 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise DrakeTeleopError(
-            "contains only poses at rest (`static`), in which no contact can be detected",
-            where=found.log.source,
-            remedy="give a log of a motion",
-        )
+        raise _static_log_error(found.log)
     if found.detection is None:
         raise DrakeTeleopError(
             f"{len(found.log)} samples are too few to separate contact from noise",
             where=found.log.source,
-            remedy=f"give a record of more than {MIN_SAMPLES} samples",
+            remedy=f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples",
         )
     return DetectedLog(**vars(found.detection), eliminated=found)

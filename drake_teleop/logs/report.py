@@ -110,7 +110,7 @@ def write_report(
         tiles=_summary_tiles(result),
         notes=summary["notes"],
         tables=tables,
-        determined=found.base.text_lines(),
+        determined=found.base_parameters.text_lines(),
         figures=[
             (
                 "Fit",

@@ -5,9 +5,10 @@ free.yaml is free motion, touched.yaml has contacts, truth.json the true values.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,10 +71,12 @@ class FingertipPush:
     stop_s: float
     push_W: tuple[float, float, float]
 
-    def force(self, t: Array) -> Array:
-        """Return the force (N, 3) on the gripper in the world [N]."""
+    def wrench_S(self, t: Array, R_WS: Array) -> Array:
+        """Return the wrench (N, 6) on the gripper about So, in S [N, N m]."""
         share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
-        return np.outer(np.sin(np.pi * share), self.push_W)
+        force = np.outer(np.sin(np.pi * share), self.push_W)
+        force_S = np.einsum("nji,nj->ni", R_WS, force)
+        return np.hstack([force_S, np.cross(FINGERTIP_POSITION_S, force_S)])
 
 
 FINGERTIP_PUSHES = (
@@ -122,10 +125,9 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
             text = to_yaml_text(_description_of_record(name), head=head, comments=_FIELD_COMMENTS)
             write_text(out / f"{name}.yaml", text)
-            _write_wrench(
-                out / f"{name}_wrench.csv", _random_motion(row), touches, TRUE_OFFSETS[row], random
-            )
-            _write_pose(out / f"{name}_pose.csv", _random_motion(row), random)
+            motion, wrench_file = _motion_of_record(row), out / f"{name}_wrench.csv"
+            _write_wrench(wrench_file, motion, touches, TRUE_OFFSETS[row], random)
+            _write_pose(out / f"{name}_pose.csv", motion, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
         write_json(out / "truth.json", to_plain_values(_true_values()))
         summary = {
@@ -156,7 +158,7 @@ def _true_values() -> dict[str, Any]:
 
 def _true_contact(touch: FingertipPush) -> dict[str, Any]:
     middle = np.array([(touch.start_s + touch.stop_s) / 2])
-    R_WS = _random_motion(1).motion_at(middle)[3][0]
+    R_WS = _motion_of_record(1)(middle)[3][0]
     peak = np.linalg.norm(touch.push_W)
     push = R_WS.T @ touch.push_W / peak
     return {"start_s": touch.start_s, "stop_s": touch.stop_s, "peak_N": peak, "push": push}
@@ -178,24 +180,26 @@ def _print_summary(out: Path) -> None:
         Console(soft_wrap=True).print(line, highlight=False, markup=False)
 
 
-@dataclass(frozen=True)
-class _SensorMotion:
-    trajectory: FourierTrajectory
-
-    def motion_at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
-        moving = np.clip(t - REST_S, 0, PERIOD_S)
-        return sensor_motion(*self.trajectory.evaluate(moving))
+_Motion: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
 
-def _random_motion(number: int) -> _SensorMotion:
+def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
     random = np.random.default_rng([2009, number])
+    return _random_motion(random, 0.5, _NUM_HARMONICS, PERIOD_S, REST_S)
+
+
+def _random_motion(
+    random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
+) -> Callable[[Array], _Motion]:
+    """Return a function of the times, with the results of `sensor_motion`."""
     sine, cosine = (
-        random.normal(size=(2, 6, _NUM_HARMONICS - 1)) * _JOINT_AMPLITUDES_RAD[:, np.newaxis] / 2
+        random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
     )
-    return _SensorMotion(FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / PERIOD_S))
+    path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period_s)
+    return lambda t: sensor_motion(*path.evaluate(np.clip(t - rest_s, 0, period_s)))
 
 
-def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
+def sensor_motion(q: Array, qd: Array, qdd: Array) -> _Motion:
     """Return specific force, omega, alpha, R_WS and p_WS of the last link, frame S."""
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
@@ -228,28 +232,28 @@ def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
 
 def _write_wrench(
     path: Path,
-    motion: _SensorMotion,
+    motion_at: Callable[[Array], _Motion],
     touches: tuple[FingertipPush, ...],
     offsets: Array,
     random: np.random.Generator,
 ) -> None:
     t = _jittered_clock(WRENCH_HZ, random)
-    s, omega, alpha, R_WS, _ = motion.motion_at(t)
+    s, omega, alpha, R_WS, _ = motion_at(t)
     wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + offsets
     for touch in touches:
-        push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
-        # The push reduces the wrench of the sensor on the load.
-        wrench -= np.hstack([push_S, np.cross(FINGERTIP_POSITION_S, push_S)])
+        wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
     _write_columns(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
 
 
-def _write_pose(path: Path, motion: _SensorMotion, random: np.random.Generator) -> None:
+def _write_pose(
+    path: Path, motion_at: Callable[[Array], _Motion], random: np.random.Generator
+) -> None:
     from scipy.spatial.transform import Rotation
 
     t = _jittered_clock(POSE_HZ, random)
-    _, _, _, R_WS, p_WS = motion.motion_at(t - POSE_DELAY_S)
+    _, _, _, R_WS, p_WS = motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
     _write_columns(path, "uptime x y z rx ry rz", [t + CLOCK_START_S, 1e3 * p_WS, turn], 4)
 
@@ -296,16 +300,7 @@ def sample_episode(
     random = np.random.default_rng([2026, seed, number])
     t = np.arange(round(duration_s * fps)) / fps
     period = duration_s - 2 * _EPISODE_REST_S
-    sine, cosine = (
-        random.normal(size=(2, 6, _EPISODE_HARMONICS - 1))
-        * 0.35
-        * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
-    )
-    path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period)
-
-    def motion_at(at: Array) -> tuple[Array, ...]:
-        return sensor_motion(*path.evaluate(np.clip(at - _EPISODE_REST_S, 0, period)))
-
+    motion_at = _random_motion(random, 0.35, _EPISODE_HARMONICS, period, _EPISODE_REST_S)
     s, omega, alpha, R_WS, _ = motion_at(t)
     contact = np.zeros((len(t), 6))
     starts = np.sort(random.uniform(0.15, 0.75, contacts)) * duration_s
@@ -313,8 +308,7 @@ def sample_episode(
         push = random.normal(size=3)
         push *= random.uniform(5, 15) / np.linalg.norm(push)
         touch = FingertipPush(start, start + random.uniform(0.4, 0.9), tuple(push))
-        f = np.einsum("nji,nj->ni", R_WS, -touch.force(t))
-        contact += np.hstack([f, np.cross(FINGERTIP_POSITION_S, f)])
+        contact -= touch.wrench_S(t, R_WS)
     offsets = TRUE_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)

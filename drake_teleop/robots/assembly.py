@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_of, rotation_matrices
+from drake_teleop.common.rotations import quaternions_from_matrices, rotation_matrices
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.logs.aligned_log import missing_orientation_error
@@ -308,7 +308,7 @@ class MotionWindow:
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
     """Return the pose (7,), [w x y z, position], from x, y, z [m], roll, pitch, yaw [deg]."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
-    return np.concatenate([quaternions_of(R)[0], numbers[:3]])
+    return np.concatenate([quaternions_from_matrices(R)[0], numbers[:3]])
 
 
 class _ClockOffset:

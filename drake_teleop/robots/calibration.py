@@ -86,7 +86,7 @@ def evaluate_record(
     delay: str | float,
 ) -> RecordEvaluation:
     """Identify a record's load; compare its uncertainty with the tolerance."""
-    count, found, why = len(tolerance.required_entries), None, ""
+    count, found, why = len(tolerance.required_entry_names), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
     except DrakeTeleopError as error:

@@ -12,7 +12,7 @@ from typing import Any
 from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
-from drake_teleop.common.texts import format_yaml, parse_yaml
+from drake_teleop.common.texts import format_yaml_value, parse_yaml
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
@@ -94,9 +94,9 @@ def json_schema() -> str:
 
 def _allowed_values(entry: FieldInfo) -> str:
     words = entry.range if entry.unit or entry.choices else entry.kind
-    if entry.lists:
+    if entry.list_depth:
         words = f"{entry.length or 'any number'} of {words}"
-    if entry.by_name:
+    if entry.is_mapping:
         words = f"mapping of names to {words}"
     return f"{words}, or null" if entry.optional else words
 
@@ -107,7 +107,7 @@ def _comment_of_field(entry: FieldInfo) -> str:
 
 def _block_lines(config: Any) -> list[str]:
     entries = fields_of(config)
-    starts = {entry.name: f"{entry.name}: {format_yaml(entry.default)}"
+    starts = {entry.name: f"{entry.name}: {format_yaml_value(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = None
@@ -128,13 +128,13 @@ def _inner_block_lines(entry: FieldInfo) -> list[str]:
     if entry.default:
         return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
-    if entry.lists:
+    if entry.list_depth:
         return _prefix_lines("# ", _field_lines(entry, blocks))
     return [line for block in blocks for line in _prefix_lines("# ", _field_lines(entry, block))]
 
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
-    if not entry.lists:
+    if not entry.list_depth:
         head = f"{entry.name}:{_tag_of_block(entry, value)}  # {entry.meaning}"
         return [head, *_prefix_lines("  ", _block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
@@ -155,7 +155,9 @@ def _sections_of_page(config: Any, path: str) -> Iterator[str]:
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
-        default = format_yaml(entry.default) if entry.kind != "block" or not entry.default else ""
+        default = (
+            format_yaml_value(entry.default) if entry.kind != "block" or not entry.default else ""
+        )
         takes = _links_to_blocks(entry, path) if entry.kind == "block" else _allowed_values(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
@@ -182,7 +184,7 @@ def _links_to_blocks(entry: FieldInfo, path: str) -> str:
         f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor_of_title(title)})"
         for title, block in _titles_of_blocks(entry, path)
     ]
-    return f"{'list of ' * entry.lists}{', '.join(links)}{', or null' * entry.optional}"
+    return f"{'list of ' * entry.list_depth}{', '.join(links)}{', or null' * entry.optional}"
 
 
 def _anchor_of_title(title: str) -> str:
@@ -197,9 +199,9 @@ def _object_schema(config: Any) -> dict[str, Any]:
 def _field_schema(entry: FieldInfo) -> dict[str, Any]:
     forms = [_item_schema(entry, item) for item in entry.blocks or (None,)]
     schema: dict[str, Any] = forms[0] if len(forms) == 1 else {"anyOf": forms}
-    for _ in range(entry.lists):
+    for _ in range(entry.list_depth):
         schema = {"type": "array", "items": schema}
-    if entry.by_name:
+    if entry.is_mapping:
         schema = {"type": "object", "additionalProperties": schema}
     if entry.length is not None:
         schema |= {"minItems": entry.length, "maxItems": entry.length}

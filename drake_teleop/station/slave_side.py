@@ -10,7 +10,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.numeric import check_identified, finite_array
+from drake_teleop.common.numeric import check_nonzero_load, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -347,7 +347,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     if estimate is not None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
-            check_identified("load_estimate", estimate[6:])
+            check_nonzero_load("load_estimate", estimate[6:])
     scales = scenario.force_scaling.scales()
     needed = {*scales.load_scales} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):

@@ -78,7 +78,7 @@ def test_block_equals_the_estimator_of_logs(method):
     history = run(MakeEstimator(method=method), rows)
     usable = np.delete(rows, 20, axis=0)
     log = by(method)
-    log.learn(usable[:, :6], usable[:, 6:9], usable[:, 9:12], usable[:, 12:15])
+    log.update_samples(usable[:, :6], usable[:, 6:9], usable[:, 9:12], usable[:, 12:15])
     np.testing.assert_array_equal(history[-1, :6], log.offsets)
     np.testing.assert_array_equal(history[-1, 6:16], log.phi)
     np.testing.assert_array_equal(history[19], history[20])
@@ -109,7 +109,7 @@ def test_total_least_squares_removes_the_bias_of_acceleration_noise():
     """Inertias of rls deviate by several sigma, those of rtls do not."""
 
     def errors(estimator: RecursiveEstimator, rows):
-        estimator.learn(rows[:, :6], rows[:, 6:9], rows[:, 9:12], rows[:, 12:15])
+        estimator.update_samples(rows[:, :6], rows[:, 6:9], rows[:, 9:12], rows[:, 12:15])
         return (estimator.phi - PHI)[[i - 6 for i in INERTIAS]]
 
     records = [samples(seed) for seed in range(20)]

@@ -99,7 +99,7 @@ def known(grasped):
     names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
     estimator = RecursiveTotalLeastSquares(SENSOR.wrench_std(), SENSOR.motion_std())
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
-    estimator.learn(*rows)
+    estimator.update_samples(*rows)
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
 
 

@@ -20,11 +20,11 @@ from drake_teleop.lab.excitation.shortest import (
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     deviations_over_tolerances,
-    read_tolerance,
+    parse_tolerance,
 )
 from drake_teleop.station.scenario import LoadScenario
 
-ASKED = read_tolerance("mass 0.1 %, com 0.1 mm, inertia 1 %")
+ASKED = parse_tolerance("mass 0.1 %, com 0.1 mm, inertia 1 %")
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
 ) -> None:
     monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
     found = design_shortest_motion(
-        slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
+        slave, parse_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
     )
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.reached.max() <= 1.0
@@ -95,4 +95,4 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
-        design_shortest_motion(slave, read_tolerance("inertia 0.00001 %"), starts=1)
+        design_shortest_motion(slave, parse_tolerance("inertia 0.00001 %"), starts=1)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.batch.consistent import Prior
 from drake_teleop.load.batch.methods import METHODS, _std_growth_by_rejection, identify_batch
 from drake_teleop.load.batch.total_least_squares import EstimatorOptions, SampleRecord
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
@@ -184,27 +183,6 @@ def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
         for method in ("whitened", "total", "consistent")
     }  # fmt: skip
     assert errors["consistent"] < 0.4 * min(errors["whitened"], errors["total"])
-
-
-@pytest.mark.parametrize("kind", ["entropic", "geodesic"])
-@pytest.mark.parametrize("offsets", [True, False])
-def test_what_only_the_prior_says_is_named(kind, offsets):
-    s = np.repeat(static_poses(), 10, axis=0)
-    F = OFFSETS * offsets + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
-    F = F + WRENCH_NOISE * np.random.default_rng(3).normal(size=F.shape)
-    thought = 1.05 * TOOL
-    prior = Prior(thought, 1.0, kind)
-    found = identify_batch(F, s, np.zeros(3), np.zeros(3), prior=prior, offsets=offsets)
-    load = found.identification
-    assert load.verdicts == ("identified",) * 10 + ("prior",) * 6
-    assert load.mass == pytest.approx(TOOL[0], rel=0.02)
-    np.testing.assert_allclose(load.phi[4:], thought[4:], atol=0.1 * thought[4])
-    # The data say nothing of the inertia but what mass and centre of mass imply: the prior's
-    # deviation where those are known.
-    expected = np.sqrt(np.diag(np.linalg.inv(prior.inverse_covariance(240)[4:, 4:])))
-    np.testing.assert_allclose(load.standard_deviations[10:], expected, rtol=0.02)
-    moved = identify_batch(*record(noise=1.0), prior=Prior(thought, 1e-4, kind)).identification
-    assert moved.verdicts == ("identified",) * 16
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -414,8 +392,6 @@ def test_bad_input_is_named():
     arrays = record(20)
     with pytest.raises(DrakeTeleopError, match=r"^method: there is no estimator 'guess'"):
         identify_batch(*arrays, method="guess")
-    with pytest.raises(DrakeTeleopError, match=r"^method: 'robust' takes no prior"):
-        identify_batch(*arrays, method="robust", prior=Prior(TOOL, 1.0))
     with pytest.raises(DrakeTeleopError, match=r"^gain_std: -.* is negative; give 0 or more"):
         identify_batch(*arrays, gain_std=-0.01)
     with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
@@ -506,7 +482,7 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     rows = np.zeros((kept.sum(), 6, 16))
     rows[:, :, :6] = np.eye(6)
     rows[:, :, 6:] = regressor(*(table[kept] for table in motion))
-    weighted = rows * with_walk.equations.channel_weights[:, None]
+    weighted = rows * with_walk.equations._weights[:, None]
     inverse = np.linalg.inv(np.einsum("nci,ncj->ij", rows, weighted))
     expected = np.einsum("nci,nm,mdj,cd->ij", weighted, walked, weighted, covariance)
     added = with_walk.identification.covariance - without.identification.covariance

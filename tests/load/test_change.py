@@ -15,7 +15,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.change import (
-    HOLD_S,
+    MIN_NEW_LOAD_AGE_S,
     OBJECT_PRIOR_STD,
     current_change_state,
     update_change_detector,
@@ -74,7 +74,7 @@ def test_an_object_is_noticed_and_known(bench, tool, kind):
         assert states[: int(bench.EVENT / bench.PERIOD)].max() == KNOWN
         alarm, change = (int(np.argmax(states >= k)) * bench.PERIOD - bench.EVENT for k in (1, 2))
         assert 0.0 < alarm < 0.05
-        assert alarm + HOLD_S - 0.02 < change < 0.5
+        assert alarm + MIN_NEW_LOAD_AGE_S - 0.02 < change < 0.5
         assert -0.02 < monitor.changed_at - bench.EVENT < 0.3
         assert states[-1] == IDENTIFIED
         pair = (monitor.load, before) if kind == "grasp" else (before, monitor.load)

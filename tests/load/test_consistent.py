@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import total_least_squares
 from drake_teleop.load.inertia import (
     is_physically_consistent,
-    mass_com_inertia,
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
@@ -41,8 +39,8 @@ def inconsistent_fit(phi, noise, number=0):
     return [next(impossible) for _ in range(number + 1)][-1]
 
 
-def consistent(form, **options):
-    return consistent_least_squares(form.gram, form.right, form.theta, **options)
+def consistent(form):
+    return consistent_least_squares(form.gram, form.right, form.theta)
 
 
 def test_a_consistent_fit_is_returned_as_it_is():
@@ -95,48 +93,3 @@ def test_the_best_of_the_consistent(seed):
         inertia = np.trace(S) * np.eye(3) - S
         other[6:] = np.concatenate([[J[3, 3]], J[:3, 3], inertia[np.triu_indices(3)]])
         assert cost(other) > cost(found) - 1e-9 * abs(cost(found))
-
-
-@pytest.mark.parametrize("kind", ["entropic", "geodesic"])
-def test_priors_pull(kind):
-    form = inconsistent_fit(PLATE, 10.0)
-    prior = 1.2 * TOOL / TOOL[0] * PLATE[0]
-    weak = consistent(form, prior=Prior(prior, 1e-9, kind))
-    np.testing.assert_allclose(weak, consistent(form), rtol=0, atol=2e-3)
-    strong = consistent(form, prior=Prior(prior, 1e7, kind))
-    np.testing.assert_allclose(strong[6:], prior, rtol=0, atol=1e-3 * prior[0])
-    middle = consistent(form, prior=Prior(prior, 1.0, kind))
-    J0 = pseudo_inertia(prior)
-    far = [
-        np.linalg.norm(np.linalg.solve(J0, pseudo_inertia(found[6:]) - J0))
-        for found in (weak, middle, strong)
-    ]
-    assert far[0] > 1.02 * far[1] > 10.0 * far[2]
-
-
-def test_all_mass_in_the_ellipsoid():
-    form = inconsistent_fit(PLATE, 10.0)
-    whole = consistent(form)
-    np.testing.assert_array_equal(
-        consistent(fit(TOOL), ellipsoid=Ellipsoid(np.zeros(3), np.eye(3))), fit(TOOL).theta
-    )
-    inside = Ellipsoid([0.0, 0.01, 0.1], np.eye(3) / 0.03**2)
-    assert inside.constraint_row() @ whole[6:] < 0.0
-    bound = consistent(form, ellipsoid=inside)[6:]
-    assert inside.constraint_row() @ bound >= -1e-6 * PLATE[0]
-    assert np.linalg.norm(mass_com_inertia(bound)[1] - [0.0, 0.01, 0.1]) < 0.03
-
-
-def test_bad_input_is_named():
-    with pytest.raises(
-        DrakeTeleopError, match=r"^prior\.kind: 'guess' is unknown; choose entropic or geodesic"
-    ):
-        Prior(TOOL, 1.0, "guess")
-    with pytest.raises(DrakeTeleopError, match=r"^prior\.weight: 0.0 is not positive"):
-        Prior(TOOL, 0.0)
-    with pytest.raises(
-        DrakeTeleopError, match=r"^prior\.phi: is the load of a body that has no extent"
-    ):
-        Prior(POINT, 1.0)
-    with pytest.raises(DrakeTeleopError, match=r"^ellipsoid\.matrix: is not positive definite"):
-        Ellipsoid(np.zeros(3), -np.eye(3)).constraint_row()

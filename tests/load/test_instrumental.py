@@ -36,7 +36,7 @@ def record(seed, samples=1500):
 
 def learnt(F, motion, instruments, **options):
     estimator = RecursiveInstrumentalVariables(NOISE, **options)
-    estimator.learn(F, *motion, instruments)
+    estimator.update_samples(F, *motion, instruments)
     return estimator
 
 
@@ -89,7 +89,7 @@ def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest
         errors.append(theta(estimator) - TRUTH)
         squares.append(np.square(errors[-1]) / np.diag(estimator.covariance))
         least = RecursiveLeastSquares(NOISE)
-        least.learn(F, *motion)
+        least.update_samples(F, *motion)
         leasts.append(theta(least) - TRUTH)
     mean = np.mean(leasts, axis=0)
     assert (np.abs(mean) > 3.0 * np.std(leasts, axis=0) / np.sqrt(30))[INERTIAS].all()
@@ -122,13 +122,13 @@ def test_standing_still_does_not_wind_up():
     s = np.tile([0.0, 0.0, 9.81], (20_000, 1))
     still = OFFSETS + non_contact_wrench(s, 0.0 * s, 0.0 * s, TOOL)
     still += NOISE * np.random.default_rng(0).normal(size=still.shape)
-    estimator.learn(still, s, 0.0 * s, 0.0 * s, np.hstack([s, 0.0 * s, 0.0 * s]))
+    estimator.update_samples(still, s, 0.0 * s, 0.0 * s, np.hstack([s, 0.0 * s, 0.0 * s]))
     assert np.isfinite(theta(estimator)).all()
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
     deviations = np.sqrt(np.diag(estimator.covariance))
     assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
     assert not estimator.is_settled
-    estimator.learn(F, *motion, commanded)
+    estimator.update_samples(F, *motion, commanded)
     assert estimator.phi[0] == pytest.approx(TOOL[0], abs=0.15)
 
 
@@ -137,7 +137,7 @@ def test_forgetting_follows_a_new_load():
     F, motion, commanded = record(4, samples=3000)
     estimator = learnt(F, motion, commanded, forgetting=0.995)
     F += non_contact_wrench(*rich_motion(3000), thing)
-    estimator.learn(F, *motion, commanded)
+    estimator.update_samples(F, *motion, commanded)
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
 
 
@@ -148,7 +148,7 @@ def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same(tmp_path):
     state = np.zeros(16)
     memory = elsewhere.initial_memory(state)
     for sample in zip(F, *motion, commanded, strict=True):
-        single.learn(*(np.reshape(part, (1, -1)) for part in sample))
+        single.update_samples(*(np.reshape(part, (1, -1)) for part in sample))
         elsewhere.update_into(state, memory, np.concatenate(sample))
     np.testing.assert_array_equal(theta(single), theta(log))
     np.testing.assert_array_equal(state, theta(log))
@@ -165,9 +165,9 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     estimator = learnt(F, motion, commanded)
     before = theta(estimator)
     with pytest.raises(DrakeTeleopError, match=r"^instruments: has shape"):
-        estimator.learn(F, *motion, np.zeros((50, 3)))
+        estimator.update_samples(F, *motion, np.zeros((50, 3)))
     with pytest.raises(DrakeTeleopError, match=r"^instruments: is not finite"):
-        estimator.learn(F, *motion, np.full((50, 9), np.inf))
+        estimator.update_samples(F, *motion, np.full((50, 9), np.inf))
     np.testing.assert_array_equal(theta(estimator), before)
     with pytest.raises(DrakeTeleopError, match="estimator: has not received a sample"):
         RecursiveInstrumentalVariables(NOISE).identification()

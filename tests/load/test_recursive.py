@@ -144,15 +144,15 @@ def test_updates_an_estimate_that_is_kept_elsewhere():
 def test_a_log_in_one_call_gives_the_same():
     F, motion = noisy_record(300)
     own, log = learnt(F, motion, forgetting=0.999), RecursiveLeastSquares(NOISE, 0.999)
-    log.learn(F[:100], *(x[:100] for x in motion))
-    log.learn(F[100:], *(x[100:] for x in motion))
+    log.update_samples(F[:100], *(x[:100] for x in motion))
+    log.update_samples(F[100:], *(x[100:] for x in motion))
     np.testing.assert_array_equal(log.phi, own.phi)
     np.testing.assert_array_equal(log.covariance, own.covariance)
     assert log.identification().samples == 300
     with pytest.raises(DrakeTeleopError, match="the numbers of samples differ"):
-        log.learn(F, *(x[:100] for x in motion))
+        log.update_samples(F, *(x[:100] for x in motion))
     with pytest.raises(DrakeTeleopError, match="is not finite"):
-        log.learn(np.full((1, 6), np.nan), REST, REST, REST)
+        log.update_samples(np.full((1, 6), np.nan), REST, REST, REST)
 
 
 def test_settles_when_the_bound_is_reached():
@@ -180,9 +180,9 @@ def test_a_load_on_an_axis_can_be_settled_and_no_load_cannot():
     for sample in zip(F, *motion, strict=True):
         estimator.update_into(theta, memory, np.concatenate(sample))
     theta[7] = 0.0
-    assert estimator.is_settled_at(theta, memory)
+    assert estimator.is_state_settled(theta, memory)
     theta[6] = 0.0
-    assert not estimator.is_settled_at(theta, memory)
+    assert not estimator.is_state_settled(theta, memory)
 
 
 def test_bad_input_is_named_and_leaves_the_estimate():

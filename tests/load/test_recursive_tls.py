@@ -37,7 +37,7 @@ def record(seed, samples=1500, motion=None, scale=1.0):
 
 def learnt(F, motion, **options):
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION, **options)
-    estimator.learn(F, *motion)
+    estimator.update_samples(F, *motion)
     return estimator
 
 
@@ -50,9 +50,9 @@ def test_without_noise_in_the_motion_it_is_least_squares():
     noise = NOISE * np.random.default_rng(0).normal(size=(2000, 6))
     F = OFFSETS + non_contact_wrench(*motion, TOOL) + noise
     total = RecursiveTotalLeastSquares(NOISE, np.zeros(9))
-    total.learn(F, *motion)
+    total.update_samples(F, *motion)
     least = RecursiveLeastSquares(NOISE)
-    least.learn(F, *motion)
+    least.update_samples(F, *motion)
     np.testing.assert_allclose(total.phi, least.phi, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(total.offsets, least.offsets, rtol=1e-6)
     ratio = np.diag(total.covariance) / np.diag(least.covariance)
@@ -75,7 +75,7 @@ def test_the_bias_of_the_inertias_is_gone_and_the_covariance_is_honest():
         F, motion = record(seed)
         total = learnt(F, motion)
         least = RecursiveLeastSquares(NOISE)
-        least.learn(F, *motion)
+        least.update_samples(F, *motion)
         totals.append(theta(total) - TRUTH)
         leasts.append(theta(least) - TRUTH)
         squares.append(np.square(totals[-1]) / np.diag(total.covariance))
@@ -111,7 +111,7 @@ def test_after_one_and_a_half_seconds_the_load_is_settled():
     F, motion = record(1, samples=20_000)
     motion = [np.ascontiguousarray(x[::2]) for x in motion]  # any rate; a slow motion
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION, bound=0.02)
-    estimator.learn(F[:40], *(x[:40] for x in motion))
+    estimator.update_samples(F[:40], *(x[:40] for x in motion))
     assert not estimator.is_settled
     F, motion = record(2)
     estimator = learnt(F, motion)
@@ -154,13 +154,13 @@ def test_standing_still_does_not_wind_up():
     estimator = learnt(F, motion, forgetting=0.99)
     s = np.tile([0.0, 0.0, 9.81], (20_000, 1))
     F_still, still = record(5, motion=(s, 0.0 * s, 0.0 * s))
-    estimator.learn(F_still, *still)
+    estimator.update_samples(F_still, *still)
     assert np.isfinite(theta(estimator)).all()
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
     assert not estimator.is_settled
     deviations = np.sqrt(np.diag(estimator.covariance))
     assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
-    estimator.learn(F, *motion)
+    estimator.update_samples(F, *motion)
     assert estimator.phi[0] == pytest.approx(TOOL[0], abs=0.15)
 
 
@@ -169,7 +169,7 @@ def test_forgetting_follows_a_new_load():
     thing = np.array([0.5, 0.0, 0.0, 0.06, 0.008, 0.0, 0.0, 0.008, 0.0, 0.001])
     F, noisy = record(6, motion=motion)
     estimator = learnt(F, noisy, forgetting=0.995)
-    estimator.learn(F + non_contact_wrench(*motion, thing), *noisy)
+    estimator.update_samples(F + non_contact_wrench(*motion, thing), *noisy)
     error = theta(estimator) - TRUTH - np.concatenate([np.zeros(6), thing])
     assert (np.abs(error) / np.sqrt(np.diag(estimator.covariance))).max() < 4.5
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
@@ -182,7 +182,7 @@ def test_an_ideal_sensor_is_no_trouble(noise_std, motion_std):
     F = OFFSETS + non_contact_wrench(*motion, TOOL)
     estimator = RecursiveTotalLeastSquares(np.full(6, noise_std), np.full(9, motion_std))
     for part in np.split(np.arange(3000), [1, 2, 5, 20, 200]):
-        estimator.learn(F[part], *(x[part] for x in motion))
+        estimator.update_samples(F[part], *(x[part] for x in motion))
         assert (np.linalg.eigvalsh(estimator.covariance) >= -1e-12).all()
     np.testing.assert_allclose(estimator.phi, TOOL, rtol=0, atol=1e-7)
     np.testing.assert_allclose(estimator.offsets, OFFSETS, rtol=0, atol=1e-6)
@@ -214,7 +214,7 @@ def test_starts_from_an_estimate():
     for _ in range(50):
         estimator.update_into(state, memory, sample)
     np.testing.assert_allclose(state, TRUTH, rtol=1e-9)
-    assert not estimator.is_settled_at(state, memory)
+    assert not estimator.is_state_settled(state, memory)
 
 
 def test_identification_is_saved_and_read(tmp_path):

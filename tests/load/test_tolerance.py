@@ -12,7 +12,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     deviations_over_tolerances,
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -23,10 +23,10 @@ PHI = phi_from_mass_com_inertia(3.1, [0.02, -0.03, 0.085], INERTIA)
 
 
 def test_words_are_read_as_they_are_written() -> None:
-    asked = read_tolerance(ALL)
+    asked = parse_tolerance(ALL)
     assert (asked.mass, asked.com, asked.inertia) == (0.005, 0.0005, 0.05)
-    assert str(asked) == ALL and len(asked.required_entries) == 10
-    assert read_tolerance("com 1e-3 m").required_entries == ("com x", "com y", "com z")
+    assert str(asked) == ALL and len(asked.required_entry_names) == 10
+    assert parse_tolerance("com 1e-3 m").required_entry_names == ("com x", "com y", "com z")
 
 
 @pytest.mark.parametrize(
@@ -35,11 +35,11 @@ def test_words_are_read_as_they_are_written() -> None:
 )  # fmt: skip
 def test_what_is_no_tolerance_is_refused(text: str) -> None:
     with pytest.raises(DrakeTeleopError, match=r"tolerance|outside"):
-        read_tolerance(text)
+        parse_tolerance(text)
 
 
 def test_small_errors_are_those_of_the_numbers_themselves() -> None:
-    asked, step = read_tolerance(ALL), 1e-6
+    asked, step = parse_tolerance(ALL), 1e-6
     steps = step * np.eye(10)
     values = partial(required_values, asked)
     moved = [values(PHI + row) - values(PHI - row) for row in steps]
@@ -54,7 +54,7 @@ def test_what_depends_on_the_unknown_is_unknown() -> None:
     covariance[10, 10] = np.inf  # I_xx
     known = np.isfinite(
         deviations_over_tolerances(
-            derivatives_over_tolerances(read_tolerance(ALL), PHI), covariance
+            derivatives_over_tolerances(parse_tolerance(ALL), PHI), covariance
         )
     )
     np.testing.assert_array_equal(known, [True] * 4 + [False] + [True] * 5)

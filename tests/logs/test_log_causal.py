@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.causal import causal_low_pass, causal_wrenches, filter_lag
+from drake_teleop.logs.causal import causal_low_pass, compute_causal_wrench, filter_lag
 
 DT, CUTOFF = 1e-3, 30.0
 
@@ -37,7 +37,7 @@ def test_it_never_looks_ahead_and_starts_settled() -> None:
 def test_a_ramp_is_late_by_the_lag_or_not_at_all(delay: float, wait: int) -> None:
     ramp = np.outer(np.arange(0, 2, DT), [1.0, 2, 3, 4, 5, 6])
     options = {"cutoff_hz": CUTOFF, "delay_s": delay}
-    late = causal_wrenches(ramp, 2 * ramp, DT, mode="delayed", **options)
+    late = compute_causal_wrench(ramp, 2 * ramp, DT, mode="delayed", **options)
     assert late.lag_s == pytest.approx(wait * DT + filter_lag(DT, CUTOFF))
     assert late.lag_s - wait * DT == pytest.approx(
         np.sqrt(2) * 3**0.25 / (2 * np.pi * CUTOFF), rel=0.005
@@ -46,7 +46,7 @@ def test_a_ramp_is_late_by_the_lag_or_not_at_all(delay: float, wait: int) -> Non
     np.testing.assert_allclose((ramp - late.contact)[1000:] / slope, late.lag_s, rtol=1e-6)
     np.testing.assert_allclose(late.scaled, 2 * late.contact, atol=1e-12)
     np.testing.assert_array_equal(late.contact[: wait + 1], 0.0)  # until the first has come
-    ahead = causal_wrenches(ramp, ramp, DT, mode="predicted", **options)
+    ahead = compute_causal_wrench(ramp, ramp, DT, mode="predicted", **options)
     np.testing.assert_allclose(ahead.contact[1000:], ramp[1000:], rtol=1e-6)
 
 
@@ -60,8 +60,8 @@ def test_prediction_costs_as_much_noise_as_is_said() -> None:
 def test_what_cannot_be_asked_for() -> None:
     x = np.zeros((50, 6))
     with pytest.raises(DrakeTeleopError, match="`predicted` needs a low-pass"):
-        causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.005, mode="predicted")
+        compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.005, mode="predicted")
     with pytest.raises(DrakeTeleopError, match="'soon' is not a causal mode"):
-        causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="soon")
-    same = causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="delayed")
+        compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="soon")
+    same = compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="delayed")
     assert same.lag_s == 0.0

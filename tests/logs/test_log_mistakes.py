@@ -13,7 +13,7 @@ import yaml
 from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.rotations import quaternions_of
+from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS
@@ -46,7 +46,7 @@ def record(seconds: float) -> Columns:
         "specific_force": at.specific_force + 0.03 * rng.normal(size=(len(t), 3)),
         "angular_velocity": at.omega + 2e-3 * rng.normal(size=(len(t), 3)),
         "angular_acceleration": at.alpha + 0.1 * rng.normal(size=(len(t), 3)),
-        "orientation": quaternions_of(at.R_WS),
+        "orientation": quaternions_from_matrices(at.R_WS),
         "position": at.p_WS + 2e-5 * rng.normal(size=(len(t), 3)),
         "R": at.R_WS,
     }

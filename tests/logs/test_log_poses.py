@@ -134,7 +134,7 @@ LIMITS = {
     "read.alignment._CHUNK_ROWS": 170,
     "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._MIN_KEPT_SAMPLES": 300,
-    "posed_fit._CHUNK": 70,
+    "posed_fit._CHUNK_SAMPLES": 70,
     "posed_fit._FILTER_NEIGHBOURS": 30,
 }
 """What an hour at 1 kHz is too long for, so low that 10 s are."""

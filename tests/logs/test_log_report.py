@@ -17,7 +17,11 @@ from drake_teleop.load.identification import PARAMETER_NAMES
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, spectrum
+from drake_teleop.logs.pictures import (
+    amplitude_spectral_densities,
+    draw_fit,
+    draw_spectrum_and_intervals,
+)
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
@@ -122,13 +126,13 @@ def _all_axes(figure) -> list:
 def test_the_spectrum_has_the_power_of_the_signal() -> None:
     dt = 1e-3
     x = np.random.default_rng(3).normal(size=(40_000, 2)) * [1.0, 3.0]
-    rate, density = spectrum(x, dt)
+    rate, density = amplitude_spectral_densities(x, dt)
     # White noise: variance over half the sampling rate, at every frequency.
     assert rate[-1] == pytest.approx(0.5 / dt)
     expected = np.array([1.0, 3.0]) * np.sqrt(2 * dt)
     np.testing.assert_allclose(np.sqrt(np.mean(density**2, axis=0)), expected, rtol=0.03)
     t = dt * np.arange(40_000)
-    rate, density = spectrum(np.sin(2 * np.pi * 50 * t)[:, None], dt)
+    rate, density = amplitude_spectral_densities(np.sin(2 * np.pi * 50 * t)[:, None], dt)
     assert rate[np.argmax(density)] == pytest.approx(50, abs=0.3)
 
 

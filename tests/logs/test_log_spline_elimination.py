@@ -18,7 +18,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass
 from drake_teleop.logs.contact import summarize_contacts
-from drake_teleop.logs.pose_motion.estimate import motion_of_load
+from drake_teleop.logs.pose_motion.estimate import fit_motion_to_load
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.pose_motion.splines import PoseSplines
@@ -317,8 +317,8 @@ def test_an_imu_is_used_where_the_load_explains_more_with_it(tmp_path, shift):
 def test_the_clock_of_the_poses_is_corrected_with_a_known_load_too(rate):
     t, wrench, poses = record(Kind(place=5e-5, turn=1e-4, seed=14))
     late = Poses(rate * poses.t, poses.position, poses.quaternion)
-    found = motion_of_load(t, wrench, late, GRAVITY_W, load_coefficients(PHI))
-    assert found.clock_rate == pytest.approx(rate - 1.0, abs=2e-5)
+    found = fit_motion_to_load(t, wrench, late, GRAVITY_W, load_coefficients(PHI))
+    assert found.clock_rate_error == pytest.approx(rate - 1.0, abs=2e-5)
 
 
 def test_the_coefficients_of_a_load_give_its_wrench():

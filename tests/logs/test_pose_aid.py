@@ -63,7 +63,7 @@ def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
     error = (aid.acceleration_W - acceleration)[100:-100]
     assert np.sqrt((error**2).mean()) == pytest.approx(NOISE[0], rel=0.1)
     assert np.abs(error.mean(axis=0)).max() < 3e-3
-    assert aid.own_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
+    assert aid.imu_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
 
 
 @pytest.mark.parametrize("size", [1.0, 0.3, 1e-3])
@@ -106,7 +106,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
     exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
     t = np.arange(0.0, SECONDS, 0.01)
     grid, taper = WrenchGrid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
-    of = make_frequency_bands(grid, taper, 6.0)
+    bands = make_frequency_bands(grid, taper, 6.0)
     clean = PoseSplines(exact, 0.05).signals(t, GRAVITY_W)
     sums, said = np.zeros(2), np.zeros(2)
     for seed in range(6):
@@ -119,11 +119,11 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
         assert aid is not None
         splines = SplineCache(noisy, aid).splines_with_spacing(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
-        power = of.sums_over_bands(
-            np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2
+        power = bands.sums_over_bands(
+            np.abs(signal_spectrum(grid, taper, error, len(bands.frequency))) ** 2
         )
-        Q = noise_moments(splines, grid, taper, clean, of, splines.estimate_pose_noise())
-        fast = of.sums_over_bands(of.frequency) / of.sizes > 2.0
+        Q = noise_moments(splines, grid, taper, clean, bands, splines.estimate_pose_noise())
+        fast = bands.sums_over_bands(bands.frequency) / bands.sizes > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()
             said[k] += np.diagonal(Q, axis1=1, axis2=2)[fast, where].sum()

@@ -21,7 +21,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
-    read_tolerance,
+    parse_tolerance,
     required_values,
     tolerances_in_units,
 )
@@ -40,7 +40,7 @@ from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Part, Rea
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
 NOISE = np.repeat([0.1, 0.005], 3)
-TOLERANCE = read_tolerance("mass 0.5 %, com 0.5 mm")
+TOLERANCE = parse_tolerance("mass 0.5 %, com 0.5 mm")
 
 
 def motion(t: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,14 +125,14 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
 def evaluate(values: np.ndarray, until: str, path: Path) -> RecordEvaluation:
     log = Log(DT * np.arange(len(values)), *np.split(values, [6, 9, 12], axis=1))
     write_log(log, path)
-    return evaluate_record(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
+    return evaluate_record(path, parse_tolerance(until), None, cutoff_hz=30.0, delay="auto")
 
 
 def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -> None:
     at = evaluate(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
     known = dict(
         zip(
-            read_tolerance("mass 5 %, inertia 20 %").required_entries,
+            parse_tolerance("mass 5 %, inertia 20 %").required_entry_names,
             at.is_within_tolerance,
             strict=True,
         )
@@ -194,12 +194,12 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
     """At rest the advice is a rotation about a horizontal axis."""
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
-    errors = derivatives_over_tolerances(read_tolerance("inertia 1 %"), PHI)
+    errors = derivatives_over_tolerances(parse_tolerance("inertia 1 %"), PHI)
     words = advise_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
     assert f"swing the wrist about {'xyz'[axis]}" in words
     rest = np.tile(9.81 * np.eye(3)[axis], (400, 1)), np.zeros((400, 3)), np.zeros((400, 3))
     words = advise_motion(
-        rest, DT, 30.0, derivatives_over_tolerances(read_tolerance("mass 1 %"), PHI), NOISE
+        rest, DT, 30.0, derivatives_over_tolerances(parse_tolerance("mass 1 %"), PHI), NOISE
     )
     assert f"about {'xyz'[axis]}" not in words and "turn" in words
 
@@ -327,7 +327,7 @@ def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) 
     assert known.return_value == 0, known.output
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["all_known"] and summary["seconds"] < 8.0
-    asked = read_tolerance("mass 1 %, com 1 mm")
+    asked = parse_tolerance("mass 1 %, com 1 mm")
     phi = json.loads((tmp_path / "out" / "identification.json").read_text())["phi"]
     error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
     assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()

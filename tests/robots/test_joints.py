@@ -20,7 +20,7 @@ from test_reading_assembly import StreamStub
 from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
+from drake_teleop.load.tolerance import parse_tolerance, required_values, tolerances_in_units
 from drake_teleop.robots.assembly import PartStreams, PoseSourceFromJoints, ReadingAssembler
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
@@ -168,7 +168,7 @@ def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_
         command += ["--until", "mass 2 %, com 2 mm", "--seconds", "28", "--out", str(tmp_path)]
         known = CliRunner().invoke(cli, command, standalone_mode=False)
     assert known.return_value == 0, known.output
-    asked = read_tolerance("mass 2 %, com 2 mm")
+    asked = parse_tolerance("mass 2 %, com 2 mm")
     phi = json.loads((tmp_path / "identification.json").read_text())["phi"]
     error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
     assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()

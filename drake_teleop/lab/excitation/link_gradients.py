@@ -18,7 +18,7 @@ from drake_teleop.common.vectors import (
     minus,
     plus,
     scale_vector,
-    symmetric_at,
+    symmetric_matrix_at,
     transposed,
     vector_at,
 )
@@ -59,7 +59,7 @@ def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
     """Add to a link's `seed` (21,) derivatives by the wrench of its load phi, both in its frame."""
     s = rotate_to_link(motion, vector_at(motion, _S))
     w = rotate_to_link(motion, vector_at(motion, _OMEGA))
-    h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
+    h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     lever = cross(g_torque, h)
     gs = plus(scale_vector(phi[0], g_force), lever)
     ga = plus(cross(h, g_force), apply_matrix(inertia, g_torque))
@@ -97,7 +97,7 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
         v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
         s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
         alpha = rotate_to_link(motion, vector_at(motion, _ALPHA))
-        h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
+        h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
         force = plus(scale_vector(phi[0], s), cross(alpha, h))
         force = plus(force, cross(omega, cross(omega, h)))
         torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))

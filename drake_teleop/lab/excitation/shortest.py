@@ -100,7 +100,7 @@ def design_shortest_motion(
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
     errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * sidak_factor(
-        len(tolerance.required_entries)
+        len(tolerance.required_entry_names)
     )
     factor = np.ones(len(errors))
     task = Task(

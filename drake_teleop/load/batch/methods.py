@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
     EstimatorFit,
     EstimatorOptions,
@@ -25,7 +25,6 @@ from drake_teleop.load.batch.uncertainty import (
     covariance_for_random_walks,
     covariance_for_white_noise,
     covariance_of_solution,
-    covariance_with_prior,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
@@ -42,7 +41,7 @@ from drake_teleop.load.normal_equations import NormalEquations
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_RELATIVE_NOISE = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_NOISE_SHARE = 0.01
+_MIN_WRENCH_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -50,7 +49,7 @@ _STD_PER_NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
-_NOTE_NOTHING_REJECTED = (
+_NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " are indistinguishable from motion errors (delay, scale, mounting): no sample was rejected"
 )
@@ -94,7 +93,7 @@ def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> Estimato
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
-    theta = consistent_least_squares(gram, right, theta, options.prior, options.ellipsoid)
+    theta = consistent_least_squares(gram, right, theta)
     return replace(fit, form=fit.form._replace(theta=theta))
 
 
@@ -112,7 +111,7 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
         moments = SecondMoments()
         moments.add(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_STD_GROWTH:
-            return replace(whole, note=_NOTE_NOTHING_REJECTED)
+            return replace(whole, note=_NOTHING_REJECTED_NOTE)
         fit = _fit_moments(moments, options, record)
         form = fit.form
         if (rejected == previous).all():
@@ -178,8 +177,6 @@ def identify_batch(
     offsets: bool = True,
     shared_noise: bool = False,
     resolution: tuple[float, float] = (0.0, 0.0),
-    prior: Prior | None = None,
-    ellipsoid: Ellipsoid | None = None,
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
@@ -197,15 +194,10 @@ def identify_batch(
     expect_type((NoiseStd, type(None)), noise, "noise")
     if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
-    if method != "consistent" and (prior, ellipsoid) != (None, None):
-        raise DrakeTeleopError(
-            f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
-        )
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     record = SampleRecord(*rows)
-    fit = METHODS[method].fit(
-        record, EstimatorOptions(noise or NoiseStd(), offsets, shared_noise, prior, ellipsoid)
-    )
+    options = EstimatorOptions(noise or NoiseStd(), offsets, shared_noise)
+    fit = METHODS[method].fit(record, options)
     equations = NormalEquations(
         np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
     )
@@ -213,7 +205,8 @@ def identify_batch(
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean_products
-    steps = residual_covariance(SecondMoments.walk_covariance(noise or NoiseStd()), theta)
+    walk = np.square(np.broadcast_to(options.noise.walk, 12))
+    steps = residual_covariance(np.diag(np.pad(walk, (1, 6))), theta)
     white = covariance_for_white_noise(plain.covariance, equations, fit)
     covariance = covariance_of_solution(
         white + covariance_for_random_walks(record, kept, fit, steps), fit.form, offsets
@@ -223,19 +216,12 @@ def identify_batch(
         covariance += (
             np.outer(known, known) * gain_std**2 * covariance_for_gain_errors(fit, offsets)
         )
-    dominated = np.zeros(16, bool)
-    if prior is not None:
-        covariance, dominated = covariance_with_prior(
-            covariance, prior.inverse_covariance(plain.samples)
-        )
-    deviations = np.sqrt(np.diag(covariance))
     identification = replace(
         plain,
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=is_precise_enough(deviations, theta[6:]) & ~dominated,
-        prior_dominated=dominated,
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
         method=METHODS[method].name,
     )
@@ -262,7 +248,7 @@ def _fit_moments(
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
             std = np.sqrt(
-                np.maximum(squares - explained, _MIN_NOISE_SHARE * squares).clip(floor**2)
+                np.maximum(squares - explained, _MIN_WRENCH_NOISE_SHARE * squares).clip(floor**2)
             )
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))

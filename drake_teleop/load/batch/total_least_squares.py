@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.moments import (
     NoiseStd,
     SecondMoments,
@@ -27,7 +26,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 
 # Largest number of weight updates, relative change of theta at convergence, smallest relative
 # distance of a root from a pole, and standard deviations of noise that a signal must exceed.
-_MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _NOISE_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
+_MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _MIN_SIGNAL_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
 _MIN_WRENCH_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
@@ -38,7 +37,7 @@ class NormalForm(NamedTuple):
         gram: (16, 16) Gram matrix per sample, compensated for noise.
         weights: (6, 6) weights between wrench channels.
         scale: ratio of residual variance to specified noise variance.
-        transfer: (16, 16) matrix from the ordinary least squares solution to theta.
+        map_from_ordinary_solution: (16, 16) matrix from ordinary least squares to theta.
     """
 
     gram: Array
@@ -46,7 +45,7 @@ class NormalForm(NamedTuple):
     theta: Array
     weights: Array
     scale: float
-    transfer: Array
+    map_from_ordinary: Array
     undetermined: NDArray[np.bool_]
 
 
@@ -65,7 +64,7 @@ def total_least_squares(
             remedy="check that the sensor is connected and that its orientation changes",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.num_samples)
+    excess = _MIN_SIGNAL_DEVIATIONS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_MAX_ITERATIONS):
         form = _solve_compensated_equations(Z, Q, W, offsets, min_gain)
@@ -106,7 +105,7 @@ def _solve_compensated_equations(
         theta=theta,
         weights=W,
         scale=scale,
-        transfer=inverse @ gram,
+        map_from_ordinary=inverse @ gram,
         undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
     )
 
@@ -137,8 +136,6 @@ class EstimatorOptions:
     noise: NoiseStd
     offsets: bool = True
     shared_noise: bool = False
-    prior: Prior | None = None
-    ellipsoid: Ellipsoid | None = None
 
 
 @dataclass(frozen=True, eq=False)

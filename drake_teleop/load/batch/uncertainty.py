@@ -37,24 +37,18 @@ _PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^
 # coefficient that is rounding.
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
-_NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
+_MIN_NUMBERED_TERM_SHARE, _MIN_ELLIPSIS_TERM_SHARE = 0.1, 0.01
 
 
-def confidence_intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi]."""
-    if not 0.0 < level < 1.0:
-        raise DrakeTeleopError(
-            f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
-        )
+def confidence_intervals(load: Identification) -> tuple[Array, Array]:
+    """Return lower and upper ends (16,) of the 95 % confidence intervals of [offsets; phi]."""
     degrees = np.minimum(load.degrees_of_freedom, _MAX_DEGREES_OF_FREEDOM)
-    half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
+    half = stdtrit(degrees, 0.5 + 0.5 * 0.95) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
     return theta - half, theta + half
 
 
-def is_prior_dominated(
-    standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
-) -> NDArray[np.bool_]:
+def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> NDArray[np.bool_]:
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
@@ -62,7 +56,7 @@ def is_prior_dominated(
             where="prior_std",
             remedy=f"give positive numbers of shape {deviations.shape}",
         )
-    return np.asarray(deviations >= share * prior)
+    return np.asarray(deviations >= 0.5 * prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +66,20 @@ class Combination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading: index of the leading parameter in `PARAMETER_NAMES`.
-        share: standard deviation relative to the natural scale of the combination.
-        words: the sum as text.
+        relative_deviation: standard deviation relative to the natural scale of the combination.
+        text: the sum in words.
     """
 
     coefficients: Array
     leading: int
     value: float
     standard_deviation: float
-    share: float
-    words: str
+    relative_std: float
+    text: str
 
     def __str__(self) -> str:
         unit = _PARAMETER_UNITS[self.leading]
-        return f"{self.words} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
+        return f"{self.text} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +87,15 @@ class BaseParameters:
     """Combinations of load and offsets that a record determines (Gautier, Khalil, 1990).
 
     Attributes:
-        without_influence: names of parameters without influence on the wrench.
-        directions: combinations of the parameters that are not identified individually.
-        slow_noise: names of wrench channels with drift.
+        parameters_without_influence: names of parameters without influence on the wrench.
+        weak_directions: combinations of the parameters that are not identified individually.
+        channels_with_slow_noise: names of wrench channels with drift.
     """
 
     combinations: tuple[Combination, ...]
-    without_influence: tuple[str, ...]
-    directions: tuple[Combination, ...]
-    slow_noise: tuple[str, ...]
+    parameters_without_influence: tuple[str, ...]
+    weak_directions: tuple[Combination, ...]
+    channels_with_slow_noise: tuple[str, ...]
 
     @property
     def num_combinations(self) -> int:
@@ -109,20 +103,22 @@ class BaseParameters:
 
     def text_lines(self) -> list[str]:
         lines = [f"{self.num_combinations} of 16 combinations of offsets and load are determined"]
-        if self.without_influence:
-            names = ", ".join(self.without_influence)
+        if self.parameters_without_influence:
+            names = ", ".join(self.parameters_without_influence)
             lines.append(f"without influence on this record: {names}")
         lines += [
             f"only together: {c}" for c in self.combinations if np.count_nonzero(c.coefficients) > 1
         ]
-        for c in self.directions:
-            if np.count_nonzero(c.coefficients) == 1 or c.share > MAX_IDENTIFIED_DEVIATION:
-                percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
+        for c in self.weak_directions:
+            if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_DEVIATION:
+                percentage = (
+                    f"{100.0 * c.relative_std:.0f} % of" if c.relative_std < 1.0 else "more than"
+                )
                 lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
-        if self.slow_noise:
-            names = ", ".join(self.slow_noise)
+        if self.channels_with_slow_noise:
+            names = ", ".join(self.channels_with_slow_noise)
             lines.append(f"drift or slow noise in {names}: all +- are lower bounds")
         return lines
 
@@ -131,7 +127,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scales(load.phi)
-    unexcited = equations.unexcited_directions
+    unexcited = equations.unexcited_columns
 
     def scaled_combination(coefficients: Array, leading: int) -> Combination:
         c = coefficients / coefficients[leading]
@@ -178,37 +174,17 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
 def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = PARAMETER_NAMES[leading]
-    for i in np.flatnonzero(weights >= _NUMBER_SHARE):
+    for i in np.flatnonzero(weights >= _MIN_NUMBERED_TERM_SHARE):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETER_NAMES[i]}"
-    small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
+    small = (weights < _MIN_NUMBERED_TERM_SHARE) & (weights >= _MIN_ELLIPSIS_TERM_SHARE)
     return text + " + ..." if small.any() else text
 
 
 TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
-
-
-def covariance_with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior; (16,) True where the prior dominates."""
-    determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
-    used = determined | (np.arange(16) >= 6)
-    # Scaled so that all entries have similar size.
-    scale = np.sqrt(np.where(determined, np.diag(covariance), 1.0))
-    scale[6:] = np.diag(information) ** -0.5
-    data, total = np.zeros((2, 16, 16))
-    block, used_block = np.ix_(determined, determined), np.ix_(used, used)
-    data[block] = np.linalg.inv(covariance[block] / np.outer(scale, scale)[block])
-    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
-    total += data
-    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
-    inverse = np.linalg.inv(total[used_block])
-    posterior[used_block] = inverse * np.outer(scale, scale)[used_block]
-    prior_share = np.zeros(16)
-    prior_share[used] = 1.0 - np.diag(inverse @ data[used_block])
-    return posterior, is_prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
 def covariance_for_white_noise(
@@ -279,7 +255,9 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
     products = (regressor_coefficients() @ Z)[:, :, 1:7]
-    effects = fit.form.transfer @ parameter_errors_by_gains(products[None], W[None], root @ root.T)
+    effects = fit.form.map_from_ordinary @ parameter_errors_by_gains(
+        products[None], W[None], root @ root.T
+    )
     return np.asarray(effects @ effects.T)
 
 
@@ -291,7 +269,7 @@ def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Arr
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
-    covariance = form.transfer @ covariance @ form.transfer.T
+    covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
     unknown = unknown | form.undetermined
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf

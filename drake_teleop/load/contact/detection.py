@@ -25,24 +25,19 @@ from drake_teleop.load.contact.noise_floor import (
     NUM_SUM_LENGTHS,
     DetectorSamples,
     NoiseFloor,
-    check_samples,
     hold_acceleration_peaks,
     noise_std_into,
     statistic_index,
+    validate_detector_samples,
     wrench_variance_by_parameters_into,
 )
 
 # Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
-# below `leave`; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6); sum of all
-# e (6); ring of its last WINDOW values.
+# below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
+# sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
 SAMPLE_COUNT_INDEX, FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 0, 3, 4, 5
-NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START, TOTAL_SUM_START, RING_BUFFER_START = (
-    8,
-    14,
-    20,
-    26,
-    32,
-)
+NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START = 8, 14, 20
+TOTAL_SUM_START, RING_BUFFER_START = 26, 32
 MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
 """Length of the memory of `update_statistics`."""
 DEFAULT_SLACK = 1.0
@@ -60,7 +55,7 @@ def update_statistics(
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
 
-    `memory` (MEMORY_SIZE,) is zero at the start; `quiet` is `leave` of `ContactDetector`.
+    `memory` (MEMORY_SIZE,) is zero at the start; `quiet` is CONTACT_END_LEVEL.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -129,12 +124,12 @@ def _statistics_of_rows(rows, parameters, slack, following, quiet, out):
 
 
 def statistics_of_log(
-    floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
+    floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK
 ) -> Array:
     """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
-    rows = check_samples(*samples)
+    rows = validate_detector_samples(*samples)
     out = np.empty((len(rows[0]), 3))
-    sums = float(positive_array("slack", slack)), float(following), CONTACT_END_LEVEL
+    sums = float(positive_array("slack", slack)), 0.0, CONTACT_END_LEVEL
     _statistics_of_rows(tuple(rows), floor.compiled_parameters, *sums, out)
     return out
 
@@ -200,10 +195,9 @@ class ContactDetector:
     Args:
         threshold: value of the statistic at which contact begins.
         statistic: "level", "cusum" or "glr".
-        leave, hold: contact ends after `hold` samples with a level below `leave`.
-        slack: slack of the cumulative sum [standard deviations].
+        hold: contact ends after `hold` samples with a level below `CONTACT_END_LEVEL`.
         following: sample period over time constant of a mean that is subtracted from the contact
-            wrench, updated while the level is below `leave`; 0: no mean.
+            wrench, updated while the level is below `CONTACT_END_LEVEL`; 0: no mean.
     """
 
     def __init__(
@@ -212,26 +206,20 @@ class ContactDetector:
         threshold: float,
         *,
         statistic: str = "cusum",
-        leave: float = CONTACT_END_LEVEL,
         hold: int = 20,
-        slack: float = DEFAULT_SLACK,
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)
-        enter, exit_level = (
-            float(positive_array("threshold", threshold)),
-            float(positive_array("leave", leave)),
-        )
+        enter = float(positive_array("threshold", threshold))
         if not 0.0 <= following < 1.0:
             raise DrakeTeleopError(
                 f"{following} is outside the range 0 <= following < 1",
                 where="following",
                 remedy="give 0 to subtract no mean",
             )
-        sums = float(positive_array("slack", slack)), float(following)
-        decision = column, enter, exit_level, int(hold)
+        decision = DEFAULT_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
-        self.settings = (floor.compiled_parameters, (*sums, *decision))
+        self.settings = (floor.compiled_parameters, decision)
         self._memory = self.initial_memory()
 
     @staticmethod
@@ -245,7 +233,7 @@ class ContactDetector:
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
         """Process N `DetectorSamples` of a log; return (N,) True for contact."""
-        rows = check_samples(*samples)
+        rows = validate_detector_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _contact_flags_of_rows(self._memory, tuple(rows), self.settings, out)
         return out
@@ -279,7 +267,7 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     from scipy.optimize import nnls
 
-    rows = check_samples(contact, s, omega, alpha, acceleration)
+    rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < 100:
         raise DrakeTeleopError(
             f"{len(rows[0])} samples are too few for a noise floor",

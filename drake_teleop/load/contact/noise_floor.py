@@ -94,10 +94,8 @@ class NoiseFloor:
         positive_array("noise", self.noise, 6)
         finite_array("covariance", self.covariance, 16, 16)
         finite_array("per_acceleration", self.per_acceleration, 6, 2)
-        correlation, rho = (
-            finite_array("correlation", self.correlation, 6, 6),
-            finite_array("rho", self.rho, 6),
-        )
+        correlation = finite_array("correlation", self.correlation, 6, 6)
+        rho = finite_array("rho", self.rho, 6)
         if (np.abs(rho) >= 1.0).any():
             raise DrakeTeleopError(
                 "has a value that is not between -1 and 1",
@@ -134,7 +132,7 @@ class NoiseFloor:
 
     def noise_std_along(self, *motion: ArrayLike) -> Array:
         """Return the noise sigma (N, 6) [N, N m] along a free motion."""
-        rows = check_samples(*motion)
+        rows = validate_detector_samples(*motion)
         out = np.empty((len(rows[0]), 6))
         noise_std_into(*rows, *self.compiled_parameters[:3], self.fade, out)
         return out
@@ -184,7 +182,7 @@ def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, ou
             out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
 
 
-def check_samples(*arrays: ArrayLike) -> list[Array]:
+def validate_detector_samples(*arrays: ArrayLike) -> list[Array]:
     named = zip(DetectorSamples._fields[-len(arrays) :], arrays, strict=True)
     return broadcast_to_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 

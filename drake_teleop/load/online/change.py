@@ -37,7 +37,8 @@ STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
 STATE_KNOWN, STATE_DISTURBED, STATE_CHANGED, STATE_IDENTIFIED = range(4)
 
-BLOCK_DURATION_S, ESTIMATE_WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
+BLOCK_DURATION_S, ESTIMATE_WINDOW_S = 0.016, 2.0
+MIN_NEW_LOAD_AGE_S, MODEL_ERROR_DURATION_S = 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
 MAX_RELATIVE_MASS_STD = 0.0025
@@ -50,9 +51,9 @@ OBJECT_PRIOR_STD = PRIOR_STD[6:]
 # Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
 # the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
 # blocks of noise reach the return limit.
-_CHI_SQUARED_SLACK, _ALARM_SUM, _RETURN_TO_KNOWN_SUM = 12.0, 60.0, -30.0
+_CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
-_MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
+_FIRST_MOMENT_BOUND_FACTOR, _MIN_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
 _MAX_NEGATIVE_DEVIATIONS = 4.0
 
@@ -61,26 +62,20 @@ _MAX_NEGATIVE_DEVIATIONS = 4.0
 (
     _STATE_INDEX,
     _BASE_STATE_INDEX,
-    _IN_BLOCK,
-    _SAMPLES,
-    _SUM,
-    _RETURN_SUM,
+    _BLOCK_SAMPLES_INDEX,
+    _SAMPLE_COUNT_INDEX,
+    _CUSUM_INDEX,
+    _RETURN_CUSUM_INDEX,
     _ESTIMATE_AGE_INDEX,
-    _START,
-    _NEW_COUNT,
-    _POWER,
+    _NEW_LOAD_START_INDEX,
+    _IDENTIFIED_SAMPLES_INDEX,
+    _ALPHA_SQUARES_INDEX,
 ) = range(10)
-_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _REGRESSOR_START, _KNOWN_FILTER_START = (
-    10,
-    16,
-    22,
-    28,
-    37,
-    97,
-)
-_MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_FILTER_START + 272, _KNOWN_FILTER_START + 544
+_KNOWN_SQUARES_START, _NEW_SQUARES_START, _WRENCH_SUM_START = 10, 16, 22
+_MOTION_SUM_START, _REGRESSOR_SUM_START, _KNOWN_LOAD_START = 28, 37, 97
+_MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_START + 544
 
-MEMORY_SIZE = _KNOWN_FILTER_START + 816
+MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
@@ -155,8 +150,9 @@ def update_estimate(estimate, V, wrench, root):
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
     phi = memory[place + 6 : place + 16].copy()
-    wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_REGRESSOR_START]
-    V = memory[_REGRESSOR_START:_KNOWN_FILTER_START].reshape(6, 10)
+    wrench = memory[_WRENCH_SUM_START:_MOTION_SUM_START]
+    motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
+    V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
     before = memory[place : place + 272].copy()
     chi = update_estimate(before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
@@ -168,37 +164,33 @@ def _update_filter(memory, place, block, noise):
 
 
 @njit(cache=True)
-def _restart_new_estimate(memory, place):
-    copy_into(memory, place, memory, _KNOWN_FILTER_START, 272)
+def _restart_filter(memory, place):
+    copy_into(memory, place, memory, _KNOWN_LOAD_START, 272)
     if place == _NEW_FILTER_START:
         for j in range(10):
             memory[place + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
-        memory[_START] = memory[_SAMPLES]
-        memory[_SQUARES:_WRENCH] = memory[_POWER] = 0.0
-    memory[_SUM] = memory[_ESTIMATE_AGE_INDEX] = 0.0
+        memory[_NEW_LOAD_START_INDEX] = memory[_SAMPLE_COUNT_INDEX]
+        memory[_NEW_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
+    memory[_CUSUM_INDEX] = memory[_ESTIMATE_AGE_INDEX] = 0.0
 
 
 @njit(cache=True)
 def _is_identified(memory, bound):
-    theta, P = (
-        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
-        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
-    )
-    change = abs(theta[6] - memory[_KNOWN_FILTER_START + 6])
+    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
+    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
+    change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
-    moment = bound * change * max(size, _MIN_SIZE_M) * _MOMENT_FACTOR
+    moment = bound * change * max(size, _MIN_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
     return math.sqrt(P[6, 6]) <= bound * change and math.sqrt(largest) <= moment
 
 
 @njit(cache=True)
 def _inflate_inertia_variances(memory, noise, block):
-    theta, P = (
-        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
-        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
-    )
+    theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
+    P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
-    share = min(1.0, expected / max(memory[_POWER], 1e-300))
+    share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
     scale = abs(theta[10]) + abs(theta[13]) + abs(theta[15]) + 2.0 * moment / abs(theta[6])
     for i in range(10, 16):
@@ -209,78 +201,78 @@ def _inflate_inertia_variances(memory, noise, block):
 def update_change_detector(memory, sample, block, noise, window, hold, bound):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = sample[SAMPLE_SPECIFIC_FORCE]
+    omega = sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     regressor_into(s, omega, alpha, V)
     known = sample[SAMPLE_WRENCH_AND_MOTION]
     for i in range(15):
-        memory[_WRENCH + i] += known[i]
+        memory[_WRENCH_SUM_START + i] += known[i]
     for i in range(6):
         for j in range(10):
-            memory[_REGRESSOR_START + 10 * i + j] += V[i, j]
-    memory[_SAMPLES] += 1.0
-    memory[_IN_BLOCK] += 1.0
-    if memory[_IN_BLOCK] >= block:
-        memory[_WRENCH:_KNOWN_FILTER_START] /= block
+            memory[_REGRESSOR_SUM_START + 10 * i + j] += V[i, j]
+    memory[_SAMPLE_COUNT_INDEX] += 1.0
+    memory[_BLOCK_SAMPLES_INDEX] += 1.0
+    if memory[_BLOCK_SAMPLES_INDEX] >= block:
+        memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] /= block
         _test_block(memory, block, noise, window, hold, bound)
-        memory[_WRENCH:_KNOWN_FILTER_START] = 0.0
-        memory[_IN_BLOCK] = 0.0
+        memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] = 0.0
+        memory[_BLOCK_SAMPLES_INDEX] = 0.0
 
 
 @njit(cache=True)
 def _test_block(memory, block, noise, window, hold, bound):
     if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]:
         if memory[_ESTIMATE_AGE_INDEX] >= window:
-            excess = memory[_SUM]
-            _restart_new_estimate(memory, _MONITOR_FILTER_START)
-            memory[_SUM] = excess
+            excess = memory[_CUSUM_INDEX]
+            _restart_filter(memory, _MONITOR_FILTER_START)
+            memory[_CUSUM_INDEX] = excess
         memory[_ESTIMATE_AGE_INDEX] += 1.0
         chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
-        memory[_SUM] = max(0.0, memory[_SUM] + chi - _CHI_SQUARED_SLACK)
-        if memory[_SUM] > _ALARM_SUM:
-            memory[_STATE_INDEX], memory[_RETURN_SUM] = STATE_DISTURBED, 0.0
-            _restart_new_estimate(memory, _NEW_FILTER_START)
+        memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
+        if memory[_CUSUM_INDEX] > _ALARM_CUSUM:
+            memory[_STATE_INDEX], memory[_RETURN_CUSUM_INDEX] = STATE_DISTURBED, 0.0
+            _restart_filter(memory, _NEW_FILTER_START)
         return
     # Return to the known load if it explains the blocks without an update.
-    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_FILTER_START, 272)
+    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
-    memory[_RETURN_SUM] = min(0.0, memory[_RETURN_SUM] + chi - _CHI_SQUARED_SLACK)
-    if memory[_RETURN_SUM] < _RETURN_TO_KNOWN_SUM:
+    memory[_RETURN_CUSUM_INDEX] = min(0.0, memory[_RETURN_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
+    if memory[_RETURN_CUSUM_INDEX] < _RETURN_TO_KNOWN_CUSUM:
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX]
-        _restart_new_estimate(memory, _MONITOR_FILTER_START)
+        _restart_filter(memory, _MONITOR_FILTER_START)
         return
     # Test whether one new load explains all blocks since its start.
     chi = _update_filter(memory, _NEW_FILTER_START, block, noise)
     memory[_ESTIMATE_AGE_INDEX] += 1.0
     for k in range(3):
-        memory[_POWER] += memory[_MOTION + 6 + k] ** 2
+        memory[_ALPHA_SQUARES_INDEX] += memory[_MOTION_SUM_START + 6 + k] ** 2
     for c in range(6):
-        residual = memory[_WRENCH + c] - memory[_NEW_FILTER_START + c]
+        residual = memory[_WRENCH_SUM_START + c] - memory[_NEW_FILTER_START + c]
         for j in range(10):
-            residual -= memory[_REGRESSOR_START + 10 * c + j] * memory[_NEW_FILTER_START + 6 + j]
-        memory[_SQUARES + c] += residual * residual
-    memory[_SUM] = max(0.0, memory[_SUM] + chi - _CHI_SQUARED_SLACK)
+            residual -= (
+                memory[_REGRESSOR_SUM_START + 10 * c + j] * memory[_NEW_FILTER_START + 6 + j]
+            )
+        memory[_NEW_SQUARES_START + c] += residual * residual
+    memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     # A clearly negative mass is not a load.
-    mass, deviation = (
-        memory[_NEW_FILTER_START + 6],
-        math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6]),
-    )
-    if memory[_SUM] > _ALARM_SUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
+    mass = memory[_NEW_FILTER_START + 6]
+    deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
+    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
-        _restart_new_estimate(memory, _NEW_FILTER_START)
+        _restart_filter(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
         memory[_STATE_INDEX] = STATE_CHANGED
     elif memory[_STATE_INDEX] == STATE_CHANGED and _is_identified(memory, bound):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
         _inflate_inertia_variances(memory, noise, block)
-        copy_into(memory, _KNOWN_FILTER_START, memory, _NEW_FILTER_START, 272)
-        memory[_NEW_COUNT] = memory[_ESTIMATE_AGE_INDEX] * block
-        for i in range(_SQUARES - _RESIDUAL):
-            memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_ESTIMATE_AGE_INDEX])
-        _restart_new_estimate(memory, _MONITOR_FILTER_START)
+        copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
+        memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
+        for i in range(_NEW_SQUARES_START - _KNOWN_SQUARES_START):
+            memory[_KNOWN_SQUARES_START + i] = memory[_NEW_SQUARES_START + i] * (
+                block / memory[_ESTIMATE_AGE_INDEX]
+            )
+        _restart_filter(memory, _MONITOR_FILTER_START)
 
 
 @njit(cache=True)
@@ -323,7 +315,8 @@ def change_detector_parameters(
     )
     block = max(1, round(BLOCK_DURATION_S / period))
     window, hold, memory = (
-        max(1, round(x / (block * period))) for x in (ESTIMATE_WINDOW_S, HOLD_S, MODEL_ERROR_S)
+        max(1, round(x / (block * period)))
+        for x in (ESTIMATE_WINDOW_S, MIN_NEW_LOAD_AGE_S, MODEL_ERROR_DURATION_S)
     )
     std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
@@ -348,15 +341,15 @@ def initial_change_memory(
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
     memory = np.zeros(MEMORY_SIZE)
-    memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 16] = np.concatenate([theta[:6], phi])
-    memory[_KNOWN_FILTER_START + 16 : _MONITOR_FILTER_START] = P.ravel()
-    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_FILTER_START, 272)
+    memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16] = np.concatenate([theta[:6], phi])
+    memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START] = P.ravel()
+    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
     return memory
 
 
 @njit(cache=True)
 def stored_known_load(memory):
-    return memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 16]
+    return memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 16]
 
 
 @njit(cache=True)
@@ -377,7 +370,7 @@ def stored_new_load(memory):
 @njit(cache=True)
 def new_load_age(memory):
     """Return the number of samples since the estimate of a new load started."""
-    return memory[_SAMPLES] - memory[_START]
+    return memory[_SAMPLE_COUNT_INDEX] - memory[_NEW_LOAD_START_INDEX]
 
 
 def detector_states_of_log(
@@ -399,20 +392,18 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    phi, P = (
-        memory[_KNOWN_FILTER_START + 6 : _KNOWN_FILTER_START + 16].copy(),
-        memory[_KNOWN_FILTER_START + 16 : _MONITOR_FILTER_START],
-    )
+    phi = memory[_KNOWN_LOAD_START + 6 : _KNOWN_LOAD_START + 16].copy()
+    P = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START]
     covariance = P.reshape(16, 16).copy()
     return replace(
         known,
         phi=phi,
-        offsets=memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 6].copy(),
+        offsets=memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 6].copy(),
         covariance=covariance,
         identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
-        residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
+        residual_rms=np.sqrt(memory[_KNOWN_SQUARES_START:_NEW_SQUARES_START]),
         method="recursive least squares",
-        samples=int(memory[_NEW_COUNT]),
+        samples=int(memory[_IDENTIFIED_SAMPLES_INDEX]),
         degrees_of_freedom=np.full(16, np.inf),
         prior_dominated=np.zeros(16, dtype=bool),
     )

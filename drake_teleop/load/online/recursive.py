@@ -59,11 +59,9 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             for c in range(6):
                 squares[c] *= forgetting
 
-        wrench, s, omega = (
-            sample[SAMPLE_WRENCH],
-            sample[SAMPLE_SPECIFIC_FORCE],
-            sample[SAMPLE_ANGULAR_VELOCITY],
-        )
+        wrench = sample[SAMPLE_WRENCH]
+        s = sample[SAMPLE_SPECIFIC_FORCE]
+        omega = sample[SAMPLE_ANGULAR_VELOCITY]
         regressor_into(s, omega, sample[SAMPLE_ANGULAR_ACCELERATION], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)
@@ -153,13 +151,13 @@ class RecursiveEstimator(ABC):
     @property
     def is_settled(self) -> bool:
         """Whether data, not the prior, determine all parameters within `bound`."""
-        return self.is_settled_at(self._theta, self._memory)
+        return self.is_state_settled(self._theta, self._memory)
 
-    def is_settled_at(self, theta: Array, memory: Array) -> bool:
+    def is_state_settled(self, theta: Array, memory: Array) -> bool:
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
-        return bool(self._is_certain(deviations, theta, self._bound).all())
+        return bool(self._are_certain(deviations, theta, self._bound).all())
 
     @abstractmethod
     def initial_memory(self, theta: Array) -> Array: ...
@@ -169,10 +167,10 @@ class RecursiveEstimator(ABC):
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
         """Update the given theta and memory by one sample, without checks."""
-        self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
+        self._update_state(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
-    def _learn(self, theta: Array, memory: Array, samples: Array) -> None: ...
+    def _update_state(self, theta: Array, memory: Array, samples: Array) -> None: ...
 
     @abstractmethod
     def _residual_rms(self) -> Array: ...
@@ -195,12 +193,14 @@ class RecursiveEstimator(ABC):
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
-    def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
+    def update_samples(
+        self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
+    ) -> None:
         """Process N samples of a free motion: wrench (N, 6), others (N, 3)."""
         _, rows = broadcast_to_rows(
             wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
         )
-        self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
+        self._update_state(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
@@ -214,7 +214,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._is_certain(deviations, self._theta, MAX_IDENTIFIED_DEVIATION),
+            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_DEVIATION),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -223,7 +223,7 @@ class RecursiveEstimator(ABC):
             prior_dominated=is_prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
-    def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
+    def _are_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return certain & is_precise_enough(
             deviations * (MAX_IDENTIFIED_DEVIATION / bound), theta[6:]
@@ -252,7 +252,7 @@ class RecursiveLeastSquares(RecursiveEstimator):
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         return memory.copy()
 
-    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+    def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._forgetting, self._prior)
         rls_update(theta, memory, samples, *options, self._squares)
 

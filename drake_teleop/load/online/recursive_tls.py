@@ -31,7 +31,7 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 # Relative increase of diagonal elements against rounding.
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
-_WRENCH, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_WRENCH_START, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_INFORMATION_EXCESS = 4.0
@@ -73,7 +73,7 @@ def write_products_vector(wrench, motion, z):
         for j in range(i + 1):
             z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
     for c in range(6):
-        z[_WRENCH + c] = wrench[c]
+        z[_WRENCH_START + c] = wrench[c]
 
 
 @njit(cache=True)
@@ -100,7 +100,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
-        L[c, _WRENCH + c] = 1.0
+        L[c, _WRENCH_START + c] = 1.0
     for t in range(len(factors)):
         L[index[t, 0], index[t, 1]] -= factors[t] * theta[index[t, 2]]
     for c in range(6):
@@ -122,7 +122,7 @@ def noise_products(Z, noise_std, motion_std, Q):
     """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
     Q[:] = 0.0
     for c in range(6):
-        Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
+        Q[_WRENCH_START + c, _WRENCH_START + c] = Z[0, 0] * noise_std[c] ** 2
     for k in range(3):
         Q[1 + k, 1 + k] = Z[0, 0] * motion_std[k] ** 2
         Q[4 + k, 4 + k] = Z[0, 0] * motion_std[6 + k] ** 2
@@ -157,7 +157,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 
 @njit(cache=True)
-def weighted_right(LZ, W, index, factors, g):
+def weighted_right_side(LZ, W, index, factors, g):
     """Write the sum of X^T W r into g (16,); LZ sums r z^T, X is [E V] of z."""
     g[:] = 0.0
     for t in range(len(factors)):
@@ -277,7 +277,7 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
             scale += W[c, d] * S[c, d]
     weighted_gram(Z, W, index, factors, E, G, 0)
     weighted_gram(Q, W, index, factors, E, N, 0)
-    weighted_right(Z[:, 13:].T, W, index, factors, g)
+    weighted_right_side(Z[:, 13:].T, W, index, factors, g)
     for i in range(16):
         G[i, 16] = g[i]
     return max(0.0, scale) / (6.0 * Z[0, 0])
@@ -383,7 +383,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SCALE_SAMPLES else 1.0
 
-    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+    def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)
         rtls_update(theta, memory, samples, *options, *nonzero_regressor_terms())
 

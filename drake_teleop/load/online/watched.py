@@ -48,13 +48,14 @@ MAX_COM_DISTANCE_M = 1.0
 
 # Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
 # force [m/s^2] at rest.
-_LOW_PASS_TIME_CONSTANT_S, _MAX_RATE, _MAX_SHIFT = 0.05, 0.02, 0.1
+_LOW_PASS_TIME_CONSTANT_S, _MAX_REST_RATE, _MAX_REST_CHANGE = 0.05, 0.02, 0.1
 
 # Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
 # force, angular velocity and residual; specific force at the start of the rest; smallest and
 # largest residual force of the new load; samples with a difference of `MIN_FORCE_CHANGE_N`.
-_STATE, _REST_SAMPLES, _SPECIFIC_FORCE_START, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
-_REST_S, _LOWEST, _HIGHEST, _CHANGED_SAMPLES, _CHANGE_DETECTOR_START = 14, 17, 20, 23, 24
+_STATE_INDEX, _REST_SAMPLES_INDEX, _SPECIFIC_FORCE_START, _OMEGA_START = 0, 1, 2, 5
+_RESIDUAL_START, _REST_FORCE_START, _LOWEST_FORCE_START, _HIGHEST_FORCE_START = 8, 14, 17, 20
+_CHANGED_SAMPLES_INDEX, _CHANGE_DETECTOR_START = 23, 24
 
 MEMORY_SIZE = _CHANGE_DETECTOR_START + change.MEMORY_SIZE
 """Length of the memory of `monitor_load`."""
@@ -62,14 +63,14 @@ MEMORY_SIZE = _CHANGE_DETECTOR_START + change.MEMORY_SIZE
 
 def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
     rest = np.zeros(_CHANGE_DETECTOR_START)
-    rest[_STATE] = STATE_SETTLED
+    rest[_STATE_INDEX] = STATE_SETTLED
     return np.concatenate([rest, change.initial_change_memory(theta, covariance)])
 
 
 @njit(cache=True)
 def current_monitor_state(memory):
     """Return the index into `LOAD_STATE_NAMES`; `STATE_LEARNING` for a memory of zeros."""
-    return int(memory[_STATE])
+    return int(memory[_STATE_INDEX])
 
 
 @njit(cache=True)
@@ -79,31 +80,32 @@ def _is_at_rest(memory, sample, period):
     shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_SPECIFIC_FORCE_START + i] += share * (s[i] - memory[_SPECIFIC_FORCE_START + i])
-        memory[_OMEGA + i] += share * (omega[i] - memory[_OMEGA + i])
-        shift += (memory[_SPECIFIC_FORCE_START + i] - memory[_REST_S + i]) ** 2
-        rate += memory[_OMEGA + i] ** 2
-    if shift > _MAX_SHIFT**2 or rate > _MAX_RATE**2:
-        memory[_REST_SAMPLES] = 0.0
-        copy_into(memory, _REST_S, memory, _SPECIFIC_FORCE_START, 3)
-    memory[_REST_SAMPLES] += 1.0
-    return memory[_REST_SAMPLES] * period > MIN_REST_S
+        memory[_OMEGA_START + i] += share * (omega[i] - memory[_OMEGA_START + i])
+        shift += (memory[_SPECIFIC_FORCE_START + i] - memory[_REST_FORCE_START + i]) ** 2
+        rate += memory[_OMEGA_START + i] ** 2
+    if shift > _MAX_REST_CHANGE**2 or rate > _MAX_REST_RATE**2:
+        memory[_REST_SAMPLES_INDEX] = 0.0
+        copy_into(memory, _REST_FORCE_START, memory, _SPECIFIC_FORCE_START, 3)
+    memory[_REST_SAMPLES_INDEX] += 1.0
+    return memory[_REST_SAMPLES_INDEX] * period > MIN_REST_S
 
 
 @njit(cache=True)
 def _force_has_changed(memory, residual, age, period):
-    low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
-    lowest, highest = memory[_LOWEST:_HIGHEST], memory[_HIGHEST:_CHANGED_SAMPLES]
+    low_passed = memory[_RESIDUAL_START : _RESIDUAL_START + 3]
+    lowest = memory[_LOWEST_FORCE_START:_HIGHEST_FORCE_START]
+    highest = memory[_HIGHEST_FORCE_START:_CHANGED_SAMPLES_INDEX]
     share = 1.0 if age == 0.0 else period / (_LOW_PASS_TIME_CONSTANT_S + period)
-    for i in range(_RESIDUAL, _RESIDUAL + 6):
-        memory[i] += share * (residual[i - _RESIDUAL] - memory[i])
+    for i in range(_RESIDUAL_START, _RESIDUAL_START + 6):
+        memory[i] += share * (residual[i - _RESIDUAL_START] - memory[i])
     if age * period < 2.0 * _LOW_PASS_TIME_CONSTANT_S:
         copy_into(lowest, 0, low_passed, 0, 3)
         copy_into(highest, 0, low_passed, 0, 3)
     copy_into(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
     copy_into(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
-    memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
-    return memory[_CHANGED_SAMPLES] * period > MIN_EXPLAINED_S
+    memory[_CHANGED_SAMPLES_INDEX] = memory[_CHANGED_SAMPLES_INDEX] + 1.0 if differs else 0.0
+    return memory[_CHANGED_SAMPLES_INDEX] * period > MIN_EXPLAINED_S
 
 
 @njit(cache=True)
@@ -122,11 +124,9 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     watch = memory[_CHANGE_DETECTOR_START:]
     update_change_detector(watch, sample, block, noise, window, hold, bound)
     known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s = sample[SAMPLE_SPECIFIC_FORCE]
+    omega = sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     non_contact_wrench_into(s, omega, alpha, known[6:], residual)
     wrench = sample[SAMPLE_WRENCH]
     for i in range(6):
@@ -134,18 +134,21 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     at_rest, verdict = _is_at_rest(memory, sample, period), current_change_state(watch)
     force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == STATE_KNOWN:
-        memory[_STATE] = STATE_SETTLED
-        if at_rest and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= MAX_OFFSET_RESIDUAL).all():
+        memory[_STATE_INDEX] = STATE_SETTLED
+        if (
+            at_rest
+            and (np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6]) <= MAX_OFFSET_RESIDUAL).all()
+        ):
             for i in range(6):
                 known[i] += period / OFFSET_TIME_S * residual[i]
-    elif memory[_STATE] != STATE_OTHER_LOAD:
+    elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
         other = (
             verdict == STATE_CHANGED
             and force_changed
             and _is_com_within_reach(known, stored_new_load(watch))
         )
-        memory[_STATE] = STATE_OTHER_LOAD if other else STATE_DISTURBED
+        memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
-    if memory[_STATE] == STATE_OTHER_LOAD:
+    if memory[_STATE_INDEX] == STATE_OTHER_LOAD:
         copy_into(target, 6, fallback, 0, 10)
     out += period / (FADE_TIME_S + period) * (target - out)

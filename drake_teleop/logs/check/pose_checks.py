@@ -138,9 +138,11 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
     """Return a finding for positions in a wrong unit, or for a pose frame that is not S."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
-    seen = found.seen
+    seen = found.units_and_axes
     if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
-        unit = _position_unit_finding(pose.position.unit, seen.kappa, seen.kappa_deviation)
+        unit = _position_unit_finding(
+            pose.position.unit, seen.position_unit_ratio, seen.position_unit_deviation
+        )
         if unit is not None:
             return unit
     return frame_finding(found, log.posed)
@@ -148,10 +150,12 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
     """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
-    frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
-    if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
+    frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.state.theta[6:]
+    if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
-    unit = abs(seen.kappa - 1.0) > max(_UNIT_TOLERANCE, 5.0 * seen.kappa_deviation)
+    unit = abs(seen.position_unit_ratio - 1.0) > max(
+        _UNIT_TOLERANCE, 5.0 * seen.position_unit_deviation
+    )
     if (
         unit
         or (seen.is_usable and seen.is_mirrored)
@@ -160,16 +164,16 @@ def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
-    if frame.shifted:
+    if frame.is_shifted:
         shift = ", ".join(f"{1e3 * x:.1f}" for x in frame.p_SoPo_S)
-        deviation = 1e3 * float(frame.position_deviations.max())
+        deviation = 1e3 * float(frame.position_deviations_m.max())
         texts.append(
             f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
         )
         lines.append(f"pose.position_in_sensor: {_rounded_for_yaml(place)}")
-    if frame.turned:
+    if frame.is_rotated:
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
-        deviation = float(frame.turn_deviations_deg.max())
+        deviation = float(frame.rotation_deviations_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {_rounded_for_yaml(frame.R_SP @ posed.R_SP)}")
     return Finding(

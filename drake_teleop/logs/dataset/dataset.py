@@ -55,7 +55,7 @@ from drake_teleop.logs.dataset.shared_load import (
     load_of_episode,
     samples_for_detector,
 )
-from drake_teleop.logs.figures import load_figures, to_plain_values
+from drake_teleop.logs.figures import summarize_load, to_plain_values
 from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
@@ -402,7 +402,7 @@ def _dataset_summary(
         "lag_frames": shared.lag,
         "noise": shared.typical / HALF_WIDTH_OF_NORMAL,
         "contact_threshold": shared.threshold,
-        **load_figures(shared.identification),
+        **summarize_load(shared.identification),
     }
 
 

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import (
-    MAX_DELAY_CHANGE_S,
+    DELAY_SEARCH_RANGE_S,
     FitWindow,
     Spectra,
     choose_knot_spacing,
@@ -29,14 +29,14 @@ from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER_PARAMETERS,
-    LOAD_PARAMETERS,
     NUM_PARAMETERS,
+    OFFSET_AND_LOAD_PARAMETERS,
     ROTATION_PARAMETERS,
     RigidFit,
     RigidParameters,
     UnitsAndAxes,
+    estimate_units_and_axes,
     fit_rigid,
-    read_units_and_axes,
 )
 from drake_teleop.logs.pose_motion.spectra import (
     MAX_FREQUENCY_HZ,
@@ -47,18 +47,18 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-SEARCHED_DURATION_S = 120.0
+MOTION_SEARCH_DURATION_S = 120.0
 """Length of the searched part of a record [s]."""
-MIN_SHIFT, MAX_SHIFT_DEVIATION = 0.01, 0.02
+MIN_REPORTED_SHIFT_M, MAX_KNOWN_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
-MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG = 5.0, 1.0
+MIN_REPORTED_ROTATION_DEG, MAX_KNOWN_ROTATION_STD_DEG = 5.0, 1.0
 """Least rotation that is reported, and largest standard deviation of a known one [deg]."""
-_MIN_WALD, _MIN_DEVIATIONS = 50.0, 5.0
+_MIN_WALD_STATISTIC, _MIN_SIGNIFICANT_DEVIATIONS = 50.0, 5.0
 _MAX_FREQUENCY_OVER_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
-_MIN_INSTANTS, _MIN_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_NEGLIGIBLE_EFFECT = 1e-3
+_MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
+_NEGLIGIBLE_ORIGIN_SENSITIVITY = 1e-3
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -69,25 +69,25 @@ class PoseFrame:
     Attributes:
         p_SoPo_S: (3,) origin of P from So, in S [m].
         R_SP: (3, 3) rotation from axes of P to those of S.
-        position_deviations: (3,) standard deviations of the origin [m]; inf if undetermined.
-        turn_deviations_deg: (3,) standard deviations of R_SP about the axes of S [deg].
-        shifted, turned: whether origin, axes differ significantly from the description.
+        position_deviations_m: (3,) standard deviations of the origin [m]; inf if undetermined.
+        rotation_deviations_deg: (3,) standard deviations of R_SP about the axes of S [deg].
+        is_shifted, is_rotated: whether origin, axes differ significantly from the description.
     """
 
     p_SoPo_S: Array
     R_SP: Array
-    position_deviations: Array
-    turn_deviations_deg: Array
-    shifted: bool
-    turned: bool
+    position_deviations_m: Array
+    rotation_deviations_deg: Array
+    is_shifted: bool
+    is_rotated: bool
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
-        return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
+        return np.asarray(self.position_deviations_m < MAX_KNOWN_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
-        return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
+        return np.asarray(self.rotation_deviations_deg < MAX_KNOWN_ROTATION_STD_DEG)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,22 +96,17 @@ class PoseMotion:
 
     Attributes:
         splines: splines of the poses, on the wrench's clock.
-        delay_s, delay_deviation: delay of the motion behind the wrench, and its standard deviation
-            [s]; inf if undetermined.
-        clock_rate: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
-        imu_agrees: whether an IMU agrees with the poses; True without one.
+        delay_s, delay_deviation_s: delay of the motion behind the wrench, and its standard
+            deviation [s]; inf if undetermined.
+        clock_rate_error: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
+        is_imu_consistent: whether an IMU agrees with the poses; True without one.
     """
 
     splines: PoseSplines
     delay_s: float
-    delay_deviation: float
-    clock_rate: float
-    imu_agrees: bool
-
-    @property
-    def spacing(self) -> float:
-        """Distance of the knots [s]."""
-        return self.splines.spacing
+    delay_deviation_s: float
+    clock_rate_error: float
+    is_imu_consistent: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +115,16 @@ class PoseEstimate(PoseMotion):
 
     Attributes:
         fit: load, with the pose frame as described or as estimated on request.
-        free: load, with the pose frame always estimated.
-        frame: pose frame of `free`.
-        seen: units, axes and masses from a fit without a rigid load.
+        free_frame_fit: load, with the pose frame always estimated.
+        frame: pose frame of `free_frame_fit`.
+        units_and_axes: units, axes and masses from a fit without a rigid load.
         t, rejected: (M,) instants [s], and True for disturbed ones.
     """
 
     fit: RigidFit
     frame: PoseFrame
-    free: RigidFit
-    seen: UnitsAndAxes
+    free_frame_fit: RigidFit
+    units_and_axes: UnitsAndAxes
     t: Array
     rejected: NDArray[np.bool_]
     note: str
@@ -141,7 +136,7 @@ class PoseEstimate(PoseMotion):
 
     @property
     def covariance(self) -> Array:
-        return self.fit.covariance[LOAD_PARAMETERS, LOAD_PARAMETERS]
+        return self.fit.covariance[OFFSET_AND_LOAD_PARAMETERS, OFFSET_AND_LOAD_PARAMETERS]
 
 
 def estimate_from_poses(
@@ -166,50 +161,55 @@ def estimate_from_poses(
     """
     with one_blas_thread():
         found, _, window = _find_motion(
-            *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_INSTANTS
+            *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_SHARED_INSTANTS
         )
         splines, late, grid = found.splines, found.delay_s, window.grid
-        window = replace(window, taper=_base_taper(grid, splines.poses, lost, late))
+        window = replace(window, taper=_taper_without_gaps(grid, splines.poses, lost, late))
         spectra = window.spectra_at_delay(splines, late)
         rejected, note = find_disturbances(spectra, splines.spacing)
         window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
         spectra = window.spectra_at_delay(splines, late)
         Z = spectra.second_moments()
         Q = noise_moments(
-            splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.estimate_pose_noise()
+            splines,
+            grid,
+            spectra.taper,
+            spectra.motion_signals,
+            spectra.bands,
+            splines.estimate_pose_noise(),
         )
-        levels = fit_noise_levels(Z, spectra.of)
+        levels = fit_noise_levels(Z, spectra.bands)
         best = fit_linear_model(Z, levels)
 
         def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
             return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
-        seen = read_units_and_axes(best)
-        start = _start_of_rigid_fit(p_SoPo_S, R_SP, seen)
+        seen = estimate_units_and_axes(best)
+        start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)
         fit_free = np.ones(NUM_PARAMETERS, bool)
         fit_free[16] = delay is None
         fit_free[LEVER_PARAMETERS], fit_free[ROTATION_PARAMETERS] = p_SoPo_S is None, R_SP is None
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
             with_frame = fit_free | (np.arange(NUM_PARAMETERS) > 16)
-            free = fit_rigid_from(_start_with_free_frame(fit, start, seen), with_frame)
+            free = fit_rigid_from(_initial_parameters_with_free_frame(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
-            delay_s=spectra.delay + fit.state.tau,
-            delay_deviation=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
-            clock_rate=found.clock_rate,
-            imu_agrees=found.imu_agrees,
+            delay_s=spectra.delay + fit.state.delay_s,
+            delay_deviation_s=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
+            clock_rate_error=found.clock_rate_error,
+            is_imu_consistent=found.is_imu_consistent,
             fit=fit,
             frame=_estimate_frame(free, start),
-            free=free,
-            seen=seen,
+            free_frame_fit=free,
+            units_and_axes=seen,
             t=grid.t,
             rejected=rejected,
             note=note,
         )
 
 
-def motion_of_load(
+def fit_motion_to_load(
     t: ArrayLike,
     wrench: ArrayLike,
     poses: Poses,
@@ -224,11 +224,11 @@ def motion_of_load(
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
-            fewest=_MIN_INSTANTS_WITH_KNOWN_LOAD,
+            fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
             load=load,
         )
         known = delay is not None
-        return replace(motion, delay_deviation=0.0 if known else delay_deviation(last))
+        return replace(motion, delay_deviation_s=0.0 if known else delay_deviation(last))
 
 
 def _find_motion(
@@ -248,7 +248,7 @@ def _find_motion(
     gravity = finite_array("gravity_W", gravity_W, 3)
     grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
-    taper = _base_taper(grid, poses, lost, guess)
+    taper = _taper_without_gaps(grid, poses, lost, guess)
     usable = int((taper > 0.5).sum())
     if usable < fewest:
         raise DrakeTeleopError(
@@ -261,9 +261,9 @@ def _find_motion(
         _MAX_FREQUENCY_OVER_RATE * grid.stride / grid.dt,
     )
     whole = FitWindow(grid, taper, gravity, top)
-    rows = _most_varied_part(grid)
+    rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
-    near_poses = _poses_near(poses, part.grid)
+    near_poses = _select_poses_around(poses, part.grid)
     cache = splines_of_averaged_poses(near_poses)
     spacing, late = guess_knot_spacing(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
@@ -289,15 +289,15 @@ def _find_motion(
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _poses_near(poses: Poses, grid: WrenchGrid) -> Poses:
-    inside = (poses.t >= grid.t[0] - 2 * MAX_DELAY_CHANGE_S) & (
-        poses.t <= grid.t[-1] + 2 * MAX_DELAY_CHANGE_S
+def _select_poses_around(poses: Poses, grid: WrenchGrid) -> Poses:
+    inside = (poses.t >= grid.t[0] - 2 * DELAY_SEARCH_RANGE_S) & (
+        poses.t <= grid.t[-1] + 2 * DELAY_SEARCH_RANGE_S
     )
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
-def _most_varied_part(grid: WrenchGrid) -> slice:
-    rows, length = len(grid.t), round(SEARCHED_DURATION_S / grid.dt)
+def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
+    rows, length = len(grid.t), round(MOTION_SEARCH_DURATION_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -307,7 +307,7 @@ def _most_varied_part(grid: WrenchGrid) -> slice:
     return slice(first, first + length)
 
 
-def _base_taper(
+def _taper_without_gaps(
     grid: WrenchGrid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float
 ) -> Array:
     stamps = poses.t - delay
@@ -324,7 +324,7 @@ def _base_taper(
     return exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
-def _start_of_rigid_fit(
+def _initial_rigid_parameters(
     p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: UnitsAndAxes
 ) -> RigidParameters:
     R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
@@ -334,18 +334,18 @@ def _start_of_rigid_fit(
     return RigidParameters(np.zeros(16), 0.0, -R @ p, R)
 
 
-def _start_with_free_frame(
+def _initial_parameters_with_free_frame(
     fit: RigidFit, start: RigidParameters, seen: UnitsAndAxes
 ) -> RigidParameters:
-    turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R) < 2.9
+    turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R_PS) < 2.9
     if not turned:
         return fit.state
     R = seen.R_SP.T
-    return RigidParameters(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
+    return RigidParameters(np.zeros(16), fit.state.delay_s, R @ start.R_PS.T @ start.p_PoSo_P, R)
 
 
 def _estimate_frame(free: RigidFit, start: RigidParameters) -> PoseFrame:
-    R_SP, r = free.state.R.T, free.state.r
+    R_SP, r = free.state.R_PS.T, free.state.p_PoSo_P
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
     # p = -R^T r, and R exp([rho x]) changes it to p - rho x p.
@@ -354,22 +354,24 @@ def _estimate_frame(free: RigidFit, start: RigidParameters) -> PoseFrame:
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE_EFFECT
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE_ORIGIN_SENSITIVITY
         deviations = np.where(lost, np.inf, deviations)
-    moved = free.state.r - start.r
-    turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
+    moved = free.state.p_PoSo_P - start.p_PoSo_P
+    turned = Rotation.from_matrix(start.R_PS.T @ free.state.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    limits = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
-    shifted = _is_significant(moved, covariance[:3, :3], MIN_SHIFT, MAX_SHIFT_DEVIATION)
+    limits = np.radians([MIN_REPORTED_ROTATION_DEG, MAX_KNOWN_ROTATION_STD_DEG])
+    shifted = _is_significant(
+        moved, covariance[:3, :3], MIN_REPORTED_SHIFT_M, MAX_KNOWN_SHIFT_STD_M
+    )
     tilted = _is_significant(turned, covariance[3:, 3:], *limits)
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,
-        position_deviations=deviations,
-        turn_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
-        shifted=bool(wald > _MIN_WALD and shifted),
-        turned=bool(wald > _MIN_WALD and tilted),
+        position_deviations_m=deviations,
+        rotation_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
+        is_shifted=bool(wald > _MIN_WALD_STATISTIC and shifted),
+        is_rotated=bool(wald > _MIN_WALD_STATISTIC and tilted),
     )
 
 
@@ -379,5 +381,5 @@ def _is_significant(x: Array, covariance: Array, least: float, largest_deviation
     length = np.linalg.norm(x)
     direction = x / (length + 1e-300)
     deviation = float(np.sqrt(direction @ covariance @ direction))
-    significant = length > max(least, _MIN_DEVIATIONS * deviation)
+    significant = length > max(least, _MIN_SIGNIFICANT_DEVIATIONS * deviation)
     return bool(significant and deviation < largest_deviation)

@@ -13,25 +13,25 @@ from drake_teleop.logs.pose_motion.spectra import ComplexArray, end_taper, exclu
 from drake_teleop.logs.pose_motion.splines import ImuSplineRows, PoseSplines
 
 _PRIOR_GAIN_STD = 0.1
-_MAX_FIT_STEPS, _MAX_SHIFT_S, _POWER_ITERATIONS, _MIN_FREQUENCIES = 4, 0.1, 10, 40
+_MAX_FIT_STEPS, _MAX_TIME_SHIFT_S, _POWER_ITERATIONS, _MIN_EFFECTIVE_FREQUENCIES = 4, 0.1, 10, 40
 _MAX_GAIN_ERROR = 0.2  # largest entry of D
 # Share of 1 / h that splines pass, and largest unexplained share of the motion.
-_PASSED_SHARE, _MAX_UNEXPLAINED = 0.25, 0.05
+_PASSED_FREQUENCY_OVER_KNOT_RATE, _MAX_UNEXPLAINED_SHARE = 0.25, 0.05
 # Rates of comparison and of added rows [Hz], and least length of a comparison [s].
-_COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
+_COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_COMPARISON_LENGTH_S = 125.0, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class _SensorModel:
-    """Sensor model y = b + (1 + D) x(t + tau) for the motion x, and its noise power."""
+    """Sensor model y = bias + (1 + gain_errors) x(t + time_shift_s) for the motion x."""
 
-    D: Array
-    b: Array
-    tau: float
-    power: float
+    gain_errors: Array
+    bias: Array
+    time_shift_s: float
+    noise_power: float
 
     def corrected_data(self, y: Array) -> Array:
-        return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
+        return np.asarray(np.linalg.solve(np.eye(3) + self.gain_errors, (y - self.bias).T).T)
 
 
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
@@ -42,7 +42,7 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
         sensor = None
         if y is not None:
             pose_noise = powers[which], 4 - 2 * which
-            sensor = _fit_sensor(splines, averaged.t, y, gravity_W, which, pose_noise)
+            sensor = _fit_sensor_model(splines, averaged.t, y, gravity_W, which, pose_noise)
             if sensor is None:
                 return None
         sensors.append(sensor)
@@ -50,13 +50,13 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     if not fitted:
         return None
     rows = imu.average_to_rate(_ROWS_RATE_HZ)
-    t = rows.t + fitted[-1].tau  # the gyroscope determines the clock best
+    t = rows.t + fitted[-1].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
         None if sensor is None or y is None else sensor.corrected_data(y[inside])
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
-    own = [0.0 if sensor is None else sensor.power for sensor in sensors]
+    own = [0.0 if sensor is None else sensor.noise_power for sensor in sensors]
     imu_rows = ImuSplineRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
     imu_rows = imu_rows.from_sensor_axes(
         PoseSplines(splines.poses, splines.spacing), gravity_W, s, omega
@@ -65,7 +65,7 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     return imu_rows.from_sensor_axes(both, gravity_W, s, omega)
 
 
-def _fit_sensor(
+def _fit_sensor_model(
     splines: PoseSplines,
     t: Array,
     y: Array,
@@ -83,11 +83,13 @@ def _fit_sensor(
     lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
-    taper = exclude_from_taper(end_taper(even, start + _MAX_SHIFT_S, stop - _MAX_SHIFT_S), lost, dt)
-    if (taper > 0.5).sum() * dt < _MIN_LENGTH_S:
+    taper = exclude_from_taper(
+        end_taper(even, start + _MAX_TIME_SHIFT_S, stop - _MAX_TIME_SHIFT_S), lost, dt
+    )
+    if (taper > 0.5).sum() * dt < _MIN_COMPARISON_LENGTH_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
-    used = frequency <= _PASSED_SHARE / splines.spacing
+    used = frequency <= _PASSED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
     noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
     energy = float(np.sum(taper**2)) / dt
 
@@ -96,12 +98,10 @@ def _fit_sensor(
 
     # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
-    Y, one, tau, power = (
-        tapered_spectrum(values),
-        tapered_spectrum(np.ones((len(even), 1))),
-        0.0,
-        least,
-    )
+    Y = tapered_spectrum(values)
+    one = tapered_spectrum(np.ones((len(even), 1)))
+    tau = 0.0
+    power = least
     for step in range(_MAX_FIT_STEPS):
         x = splines.motion(even + tau, gravity_W)[which]
         X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))
@@ -112,11 +112,11 @@ def _fit_sensor(
         residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
         power = _estimate_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
-        if abs(tau) > _MAX_SHIFT_S:
+        if abs(tau) > _MAX_TIME_SHIFT_S:
             return None
     if (
         np.abs(D).max() > _MAX_GAIN_ERROR
-        or residual[1:].sum() > _MAX_UNEXPLAINED * (np.abs(X[1:]) ** 2).sum()
+        or residual[1:].sum() > _MAX_UNEXPLAINED_SHARE * (np.abs(X[1:]) ** 2).sum()
     ):
         return None
     return _SensorModel(D, b, tau, power)
@@ -147,4 +147,4 @@ def _estimate_noise_power(
         weight = 1.0 / (power + pose_noise) ** 2
         power = max(float(weight @ (residual - pose_noise) / weight.sum()), white)
     effective = float(np.sum((white / (white + pose_noise)) ** 2))
-    return power if effective > _MIN_FREQUENCIES else white
+    return power if effective > _MIN_EFFECTIVE_FREQUENCIES else white

@@ -11,7 +11,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array, parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
-    FORCE_COLUMNS,
+    WRENCH_COLUMNS,
     ComplexArray,
     FrequencyBands,
     NoiseLevels,
@@ -35,18 +35,18 @@ from drake_teleop.logs.pose_motion.splines import (
 
 TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried first; then two between the best and its neighbours [s]."""
-MAX_DELAY_CHANGE_S = 0.25
+DELAY_SEARCH_RANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
-ROUNDING_SHARE = 1e-7
+MIN_NOISE_OVER_WRENCH = 1e-7
 """Least noise of a channel relative to the wrench."""
-_COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
+_COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
 _FIT_ITERATIONS = 4
 _SEARCH_RATE_HZ = 125.0
-_RANK_TOLERANCE, _FULL_RANK_TOLERANCE = 1e-12, 1e-8
+_RANK_TOLERANCE, _MIN_FULL_RANK_PIVOT = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _TRIED_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
-_MIN_COST_REDUCTION = 3.0
-_SPACING_FACTOR, _SPACING_FACTOR_WITH_KNOWN_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
+_MIN_DRIFT_COST_REDUCTION = 3.0
+_SPACING_MARGIN, _SPACING_MARGIN_WITH_KNOWN_LOAD, _MIN_DELAY_COST_RISE = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,22 +73,19 @@ class LinearFit:
 
 def fit_linear_model(Z: Array, levels: NoiseLevels) -> LinearFit:
     """Fit the wrench by 16 signals of the motion, from second moments Z (bands, 38, 38)."""
-    return _fit_moments(
-        Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-        Z[:, :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
-        _wrench_powers(Z),
-        levels,
-    )
+    return _fit_moments(*_moments_of_signals_and_wrench(Z), levels)
 
 
-def _wrench_powers(Z: Array) -> Array:
-    return np.diagonal(Z[:, FORCE_COLUMNS, FORCE_COLUMNS], axis1=1, axis2=2)
+def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
+    zz = Z[..., :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS]
+    powers = np.diagonal(Z[..., WRENCH_COLUMNS, WRENCH_COLUMNS], axis1=-2, axis2=-1)
+    return zz, Z[..., :NUM_MOTION_SIGNALS, WRENCH_COLUMNS], powers
 
 
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    floor = _rounding_power(ff, levels.sizes)
+    floor = _rounding_error_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -122,7 +119,7 @@ def _pseudo_inverses(gram: Array) -> Array:
     largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
     try:
         pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
-        if (pivots > _FULL_RANK_TOLERANCE * largest).all():
+        if (pivots > _MIN_FULL_RANK_PIVOT * largest).all():
             return np.asarray(np.linalg.inv(gram))  # three times faster
     except np.linalg.LinAlgError:
         pass
@@ -134,21 +131,22 @@ def _pseudo_inverses(gram: Array) -> Array:
 
 def rounding_error_power(Z: Array, sizes: Array) -> Array:
     """Return the power (6,) of rounding errors in the wrench channels."""
-    return _rounding_power(_wrench_powers(Z), sizes)
+    return _rounding_error_power(_moments_of_signals_and_wrench(Z)[2], sizes)
 
 
-def _rounding_power(ff: Array, sizes: Array) -> Array:
+def _rounding_error_power(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
-    return np.maximum(ROUNDING_SHARE**2 * both, 1e-60)
+    return np.maximum(MIN_NOISE_OVER_WRENCH**2 * both, 1e-60)
 
 
-def fit_noise_levels(Z: Array, of: FrequencyBands) -> NoiseLevels:
+def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
     """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
-    levels = NoiseLevels.white_within_groups(of)
-    least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
+    levels = NoiseLevels.white_within_groups(bands)
+    least = fit_linear_model(Z, levels).costs - _MIN_DRIFT_COST_REDUCTION
+    shape = levels.shape.copy()
     for corner in _TRIED_DRIFT_CORNERS_HZ:
-        rising = np.repeat(random_walk_shape(of, corner)[:, None], 6, axis=1)
+        rising = np.repeat(random_walk_shape(bands, corner)[:, None], 6, axis=1)
         costs = fit_linear_model(Z, replace(levels, shape=rising)).costs
         better = costs < least
         least, shape = np.where(better, costs, least), np.where(better, rising, shape)
@@ -162,54 +160,50 @@ class Spectra:
     Attributes:
         grid, taper: instants of the record, and their weights (M,).
         delay: delay of the signals [s].
-        zeta: (M, 16) motion signals over time.
+        motion_signals: (M, 16) signals zeta over time.
     """
 
-    of: FrequencyBands
+    bands: FrequencyBands
     wrench: ComplexArray
     signals: ComplexArray
     delay: float
     grid: WrenchGrid
     taper: Array
-    zeta: Array
+    motion_signals: Array
 
     @property
-    def max_delay_change_s(self) -> float:
-        return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
+    def delay_search_range_s(self) -> float:
+        return min(DELAY_SEARCH_RANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
 
     @cached_property
     def is_taper_fixed(self) -> bool:
         """Whether the weights of samples stay in place when the delay changes."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
-        return bool(edged or self.grid.load is not None)
+        return bool(edged or self.grid.known_load is not None)
 
     def with_delay(self, delay: float) -> Spectra:
         shift, signals = delay - self.delay, self.signals
         if self.is_taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
-            signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
-        late = shift_spectrum(signals, self.of.frequency, shift)
+            signals = signal_spectrum(self.grid, before, self.motion_signals, len(signals))
+        late = shift_spectrum(signals, self.bands.frequency, shift)
         late[:, 0] = self.signals[:, 0]
         return replace(self, signals=late)
 
     def second_moments(self) -> Array:
         """Return second moments (bands, 38, 38) of signals, wrench, and derivatives of signals."""
-        rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
+        rates = 2j * np.pi * self.bands.frequency[:, None] * self.signals
         edges = taper_derivative(self.grid, self.taper)
-        rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
+        rates -= signal_spectrum(self.grid, edges, self.motion_signals, len(rates))
         rates[:, 0] = 0.0
-        return second_moments(self.signals, self.wrench, self.of, rates)
+        return second_moments(self.signals, self.wrench, self.bands, rates)
 
     def fit_coefficients(self) -> LinearFit:
         """Fit the coefficients of all signals, or only the constants if the load is known."""
-        Z, load = second_moments(self.signals, self.wrench, self.of), self.grid.load
-        parts = (
-            Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-            Z[:, :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
-            _wrench_powers(Z),
-        )
-        fit = _fit_moments(*parts, NoiseLevels.white_within_groups(self.of), load)
+        Z, load = second_moments(self.signals, self.wrench, self.bands), self.grid.known_load
+        levels = NoiseLevels.white_within_groups(self.bands)
+        fit = _fit_moments(*_moments_of_signals_and_wrench(Z), levels, load)
         if load is None:
             return fit
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
@@ -218,39 +212,30 @@ class Spectra:
         """Return the negative log likelihoods (D,) of fits with delays (D,) [s]."""
         if self.is_taper_fixed:
             Z = np.array(
-                [second_moments(x.signals, x.wrench, x.of) for x in map(self.with_delay, delays)]
+                [second_moments(x.signals, x.wrench, x.bands) for x in map(self.with_delay, delays)]
             )
-            zz, zf = (
-                Z[..., :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
-                Z[..., :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
-            )
+            zz, zf, _ = _moments_of_signals_and_wrench(Z)
         else:
             zz, zf = self._delayed_moments(np.asarray(delays))
-        power = np.abs(self.wrench) ** 2
-        fits = _fit_moments(
-            zz,
-            zf,
-            self.of.sums_over_bands(power),
-            NoiseLevels.white_within_groups(self.of),
-            self.grid.load,
-        )
-        return fits.costs.sum(axis=-1)
+        ff = self.bands.sums_over_bands(np.abs(self.wrench) ** 2)
+        levels = NoiseLevels.white_within_groups(self.bands)
+        return _fit_moments(zz, zf, ff, levels, self.grid.known_load).costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
         """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
-        of, Z = self.of, second_moments(self.signals, self.wrench, self.of)
-        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
+        bands, Z = self.bands, second_moments(self.signals, self.wrench, self.bands)
+        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * bands.weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
         flat = products.reshape(len(products), -1)
-        angle = 2.0 * np.pi * np.outer(delays - self.delay, of.frequency)
+        angle = 2.0 * np.pi * np.outer(delays - self.delay, bands.frequency)
         cosine, sine = np.cos(angle), np.sin(angle)
-        starts = np.searchsorted(of.band, np.arange(of.count + 1))
-        sums = np.empty((len(delays), of.count, flat.shape[1]))
-        for k in range(of.count):
+        starts = np.searchsorted(bands.band, np.arange(bands.count + 1))
+        sums = np.empty((len(delays), bands.count, flat.shape[1]))
+        for k in range(bands.count):
             part = slice(starts[k], starts[k + 1])
             sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
-        zf = sums.reshape(len(delays), of.count, NUM_MOTION_SIGNALS, 7)
-        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, FORCE_COLUMNS], Z[:, 0, 0]
+        zf = sums.reshape(len(delays), bands.count, NUM_MOTION_SIGNALS, 7)
+        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, WRENCH_COLUMNS], Z[:, 0, 0]
         zz = np.repeat(Z[None, :, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS], len(delays), axis=0)
         zz[..., 0] = zz[..., 0, :] = zf[..., 6]
         return zz, zf[..., :6]
@@ -259,7 +244,7 @@ class Spectra:
         """Return the spectra with the signals of other splines at a delay [s]."""
         zeta = splines.signals(self.grid.t + delay, gravity_W)
         signals = signal_spectrum(self.grid, self.taper, zeta, len(self.wrench))
-        return replace(self, signals=signals, delay=delay, zeta=zeta)
+        return replace(self, signals=signals, delay=delay, motion_signals=zeta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +254,7 @@ class FitWindow:
     grid: WrenchGrid
     taper: Array
     gravity_W: Array
-    top: float
+    max_frequency_hz: float
 
     def select_rows(self, rows: slice) -> FitWindow:
         grid = self.grid
@@ -280,19 +265,19 @@ class FitWindow:
 
     def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
         """Return spectra of the wrench, and of the motion `delay` [s] later."""
-        of = make_frequency_bands(self.grid, self.taper, self.top)
-        count = len(of.frequency)
+        bands = make_frequency_bands(self.grid, self.taper, self.max_frequency_hz)
+        count = len(bands.frequency)
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
         wrench = wrench_spectrum(self.grid, self.taper, count)
         signals = signal_spectrum(self.grid, self.taper, zeta, count)
-        return Spectra(of, wrench, signals, delay, self.grid, self.taper, zeta)
+        return Spectra(bands, wrench, signals, delay, self.grid, self.taper, zeta)
 
 
 def best_delay(
-    spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
+    spectra: Spectra, reach: float, finest: float = _FINEST_DELAY_STEP_S
 ) -> tuple[float, float]:
     """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
-    step = min(_COARSE_STEP_S, reach / 2)
+    step = min(_COARSE_DELAY_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs_at_delays(at)
     while step > finest:
@@ -307,14 +292,14 @@ def best_delay(
 
 def delay_deviation(spectra: Spectra) -> float:
     """Return the standard deviation of the delay [s]; inf if undetermined."""
-    reach = spectra.max_delay_change_s
-    beside = np.array([-_FINE_STEP_S, 0.0, _FINE_STEP_S])
+    reach = spectra.delay_search_range_s
+    beside = np.array([-_FINE_DELAY_STEP_S, 0.0, _FINE_DELAY_STEP_S])
     left, least, right = spectra.costs_at_delays(spectra.delay + beside)
-    far = spectra.costs_at_delays(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
+    far = spectra.costs_at_delays(spectra.delay + np.arange(-reach, reach, _COARSE_DELAY_STEP_S))
     bend = left - 2.0 * least + right
-    if bend <= 0.0 or far.max() - least < _MIN_COST_RISE or far.min() < least - 1.0:
+    if bend <= 0.0 or far.max() - least < _MIN_DELAY_COST_RISE or far.min() < least - 1.0:
         return np.inf
-    return float(_FINE_STEP_S / np.sqrt(bend))
+    return float(_FINE_DELAY_STEP_S / np.sqrt(bend))
 
 
 def guess_knot_spacing(
@@ -331,7 +316,7 @@ def guess_knot_spacing(
         if known:
             found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = best_delay(spectra, spectra.max_delay_change_s, _FINE_STEP_S)
+        late, cost = best_delay(spectra, spectra.delay_search_range_s, _FINE_DELAY_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
@@ -363,11 +348,11 @@ def choose_knot_spacing(
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
-    finer = _SPACING_FACTOR if window.grid.load is None else _SPACING_FACTOR_WITH_KNOWN_LOAD
+    finer = _SPACING_MARGIN if window.grid.known_load is None else _SPACING_MARGIN_WITH_KNOWN_LOAD
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
         last = start.with_motion(cache.splines_with_spacing(best), window.gravity_W, delay)
-        delay, _ = best_delay(last, 3 * _COARSE_STEP_S)
+        delay, _ = best_delay(last, 3 * _COARSE_DELAY_STEP_S)
     return cache, best, delay
 
 
@@ -376,9 +361,9 @@ def splines_of_averaged_poses(poses: Poses) -> SplineCache:
     return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
-def _neighbouring_spacings(h: float, of: list[float]) -> list[float]:
-    k = of.index(h)
-    return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
+def _neighbouring_spacings(h: float, spacings: list[float]) -> list[float]:
+    k = spacings.index(h)
+    return spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]
 
 
 def _allowed_spacings(cache: SplineCache) -> list[float]:
@@ -389,7 +374,7 @@ def _allowed_spacings(cache: SplineCache) -> list[float]:
 
 _MAX_CLOCK_RATE_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
-_MAX_CLOCK_CHANGE_S = 0.2
+_MAX_DELAY_CHANGE_BY_CLOCK_S = 0.2
 
 
 def estimate_clock_rate_error(
@@ -404,7 +389,7 @@ def estimate_clock_rate_error(
         trial = best + step
         if gain < _MIN_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
-        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CLOCK_CHANGE_S:
+        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_DELAY_CHANGE_BY_CLOCK_S:
             break
         splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)
@@ -423,15 +408,15 @@ def correct_clock_rate(poses: Poses, rate: float, grid: WrenchGrid, delay: float
 
 def _clock_rate_and_delay_step(spectra: Spectra) -> tuple[float, float]:
     fit, grid = spectra.fit_coefficients(), spectra.grid
-    change = np.gradient(spectra.zeta, grid.dt, axis=0)
+    change = np.gradient(spectra.motion_signals, grid.dt, axis=0)
     from_middle = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]
-    count = len(spectra.of.frequency)
-    free = spectra.signals if grid.load is None else spectra.signals[:, :1]
+    count = len(spectra.bands.frequency)
+    free = spectra.signals if grid.known_load is None else spectra.signals[:, :1]
     k = free.shape[1]
     moves = [signal_spectrum(grid, spectra.taper, x, count) for x in (from_middle * change, change)]
     gram, right = np.zeros((2, 2)), np.zeros(2)
     for c, C in enumerate(fit.coefficients):
-        weight = np.sqrt(spectra.of.weight / fit.power[spectra.of.band, c])[:, None]
+        weight = np.sqrt(spectra.bands.weight / fit.power[spectra.bands.band, c])[:, None]
         columns = np.column_stack([free, *(x @ C for x in moves)])
         left = (spectra.wrench[:, c] - spectra.signals @ C)[:, None]
         y = (np.hstack([columns, left]) * weight).view(np.float64).reshape(count, -1, 2)

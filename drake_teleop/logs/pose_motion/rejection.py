@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.linear_model import ROUNDING_SHARE, Spectra
+from drake_teleop.logs.pose_motion.linear_model import MIN_NOISE_OVER_WRENCH, Spectra
 from drake_teleop.logs.pose_motion.spectra import WrenchGrid, distance_to_flag
-from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
+from drake_teleop.logs.pose_motion.splines import COLUMNS_ZERO_AT_REST
 
 NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so disturbances"
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
-_STD_OVER_MAD = 1.4826
-_MAX_INFORMATION_LOSS = 2.5
+_STD_PER_NORMAL_MAD = 1.4826
+_MAX_STD_GROWTH = 2.5
 _HALF_GAIN_OVER_KNOT_RATE = 0.3
 _MIN_MARGIN_S = 0.1
 """Least margin on both sides of a rejected time span [s]."""
@@ -25,7 +25,7 @@ _MIN_MARGIN_S = 0.1
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return (M,) True for contact, impact or saturation, and a note for the user."""
     # A Gaussian gain, one half at `_HALF_GAIN_OVER_KNOT_RATE` / h, does not ring.
-    gain = 0.5 ** ((spectra.of.frequency * spacing / _HALF_GAIN_OVER_KNOT_RATE) ** 2)
+    gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid
     x, y = (
         _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)
@@ -33,13 +33,11 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     inside = spectra.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
-    if grid.load is None:
+    if grid.known_load is None:
         x = test_signals = x[:, used] / size[used]
     else:
-        y, test_signals = (
-            y - x @ grid.load.T,
-            x[:, MOTION_COLUMNS] @ grid.load[:3, MOTION_COLUMNS].T,
-        )
+        y = y - x @ grid.known_load.T
+        test_signals = x[:, COLUMNS_ZERO_AT_REST] @ grid.known_load[:3, COLUMNS_ZERO_AT_REST].T
         x, test_signals = x[:, :1] / size[0], np.linalg.norm(test_signals, axis=1, keepdims=True)
     weights = inside.astype(float)
     for _ in range(_MAX_FITS):
@@ -50,17 +48,15 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
             break
     rejected = np.zeros(len(x), bool)
     for _ in range(_MAX_FITS):
-        last, rejected = (
-            rejected,
-            _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT,
-        )
+        last = rejected
+        rejected = _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break
     if not rejected.any():
         return rejected, ""
     rejected = distance_to_flag(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
-    if _information_loss(test_signals, inside, inside & ~rejected) > _MAX_INFORMATION_LOSS:
+    if _std_growth_by_rejection(test_signals, inside, inside & ~rejected) > _MAX_STD_GROWTH:
         return np.zeros(len(x), bool), NOTHING_REJECTED_NOTE
     return rejected, ""
 
@@ -77,12 +73,14 @@ def _normalized_residual_distances(
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
-    scale = _STD_OVER_MAD * np.median(residual[inside], axis=0)
+    scale = _STD_PER_NORMAL_MAD * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    return np.asarray((residual / np.maximum(scale, ROUNDING_SHARE * rms + 1e-30)).max(axis=1))
+    return np.asarray(
+        (residual / np.maximum(scale, MIN_NOISE_OVER_WRENCH * rms + 1e-30)).max(axis=1)
+    )
 
 
-def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
+def _std_growth_by_rejection(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     whole, left = (x[rows].T @ x[rows] for rows in (inside, kept))

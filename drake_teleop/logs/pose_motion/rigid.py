@@ -14,37 +14,41 @@ from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, parameter_errors_b
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
 from drake_teleop.logs.pose_motion.spectra import (
-    FORCE_COLUMNS,
     MOMENTS_SIZE,
     SIGNAL_RATE_COLUMNS,
+    WRENCH_COLUMNS,
     NoiseLevels,
 )
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SIGNALS
 
 NUM_PARAMETERS = 23
 """Number of parameters: [offsets; phi] (16), tau, r (3), rho (3)."""
-LOAD_PARAMETERS, DELAY_PARAMETER, LEVER_PARAMETERS, ROTATION_PARAMETERS = (
-    slice(0, 16),
-    slice(16, 17),
-    slice(17, 20),
-    slice(20, 23),
-)
+OFFSET_AND_LOAD_PARAMETERS = slice(0, 16)
+DELAY_PARAMETER = slice(16, 17)
+LEVER_PARAMETERS = slice(17, 20)
+ROTATION_PARAMETERS = slice(20, 23)
 _MAX_FIT_STEPS, _CONVERGENCE_TOLERANCE = 40, 1e-4
-_MAX_RIGID_RATIO, _GAIN_MISFIT_FACTOR, _NOISE_RATIO = 4.0, 1.5, 1.5
+_MAX_RIGID_MISFIT_OVER_DEGREES, _GAIN_MISFIT_MARGIN, _NOISE_MISFIT_OVER_DEGREES = 4.0, 1.5, 1.5
 _MAX_PARAMETER_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_MIN_OWN_NOISE_SHARE = 0.1
+_MIN_WRENCH_NOISE_SHARE = 0.1
 _ROTATION_STEP_RAD = 1e-4  # rad, step of a numerical derivative
 _RANK_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class RigidParameters:
-    """Parameters: theta = [offsets; phi] (16,), delay tau [s], r = p_PoSo (3,) [m], R_PS (3, 3)."""
+    """Parameters of a rigid load, its delay and its pose frame.
+
+    Attributes:
+        theta: (16,) [offsets; phi].
+        delay_s: delay tau of the poses [s].
+        p_PoSo_P, R_PS: lever r (3,) [m] and rotation R (3, 3) of Eq. (T79).
+    """
 
     theta: Array
-    tau: float
-    r: Array
-    R: Array
+    delay_s: float
+    p_PoSo_P: Array
+    R_PS: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,40 +56,37 @@ class RigidFit:
     """Fit of a rigid load to wrench and poses.
 
     Attributes:
-        state: estimated parameters; tau is relative to the delay of the moments.
+        state: estimated parameters; `delay_s` is relative to the delay of the moments.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
-        misfit, degrees: twice the log likelihood ratio to the linear model, and its degrees of
-            freedom.
+        misfit, degrees_of_freedom: twice the log likelihood ratio to the linear model, and its
+            degrees of freedom.
         misfit_of_gains: expected increase of the misfit by the stated gain errors.
-        one_weight: whether all frequency bands had the same weight.
     """
 
     state: RigidParameters
     covariance: Array
     misfit: float
-    degrees: float
+    degrees_of_freedom: float
     misfit_of_gains: float = 0.0
-    one_weight: bool = False
 
     @property
     def is_rigid(self) -> bool:
         """Whether the misfit is below four times its degrees of freedom."""
-        return self.misfit < _MAX_RIGID_RATIO * self.degrees
+        return self.misfit < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom
 
     @property
     def is_explained_by_gains(self) -> bool:
         """Whether a rigid load with the stated gain errors explains the wrench."""
-        return (
-            self.misfit
-            < _MAX_RIGID_RATIO * self.degrees + _GAIN_MISFIT_FACTOR * self.misfit_of_gains
-        )
+        by_gains = _GAIN_MISFIT_MARGIN * self.misfit_of_gains
+        return self.misfit < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom + by_gains
 
     @property
     def deviation_inflation(self) -> float:
         """Factor (>= 1) on standard deviations due to misfit."""
-        left = self.misfit - _GAIN_MISFIT_FACTOR * self.misfit_of_gains
-        return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
+        left = self.misfit - _GAIN_MISFIT_MARGIN * self.misfit_of_gains
+        by_noise = _NOISE_MISFIT_OVER_DEGREES * self.degrees_of_freedom
+        return float(np.sqrt(max(1.0, left / by_noise)))
 
 
 def motion_transformation_matrix(R: Array, r: Array) -> Array:
@@ -104,7 +105,7 @@ def motion_transformation_matrix(R: Array, r: Array) -> Array:
     return M
 
 
-_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_OMEGA_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
@@ -112,14 +113,14 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
 
     `removed_weight` [m, m c] (4,) is the load whose weight the robot removed from the wrench.
     """
-    C = _load_coefficients(phi)
+    C = _coefficients_with_full_weight(phi)
     if removed_weight is not None:
-        weight = _load_coefficients(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = _coefficients_with_full_weight(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
 
-def _load_coefficients(phi: Array) -> Array:
+def _coefficients_with_full_weight(phi: Array) -> Array:
     theta = np.concatenate([np.zeros(6), phi])
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
     return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
@@ -127,8 +128,8 @@ def _load_coefficients(phi: Array) -> Array:
 
 def _rotated_products(R: Array) -> Array:
     out = np.empty((6, 6))
-    for row, (i, j) in enumerate(_PRODUCT_PAIRS):
-        for column, (k, m) in enumerate(_PRODUCT_PAIRS):
+    for row, (i, j) in enumerate(_OMEGA_PRODUCT_PAIRS):
+        for column, (k, m) in enumerate(_OMEGA_PRODUCT_PAIRS):
             out[row, column] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
     return out
 
@@ -151,26 +152,27 @@ def fit_rigid(
     record = _FitData(Z, Q, levels, free, linear.power)
     solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
-    plain = _solve_rigid_fit(replace(record, Q=np.zeros_like(Q)), solution.state)
-    least = rounding_error_power(record.Z, levels.sizes)
-    power = np.maximum(levels.noise_power(_residual_sums(record, plain.state)), least)
+    plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.state)
+    least = rounding_error_power(record.moments, levels.sizes)
+    power = np.maximum(levels.noise_power(_residual_channel_powers(record, plain.state)), least)
     fit = RigidFit(
         solution.state,
         covariance=np.zeros((0, 0)),
         misfit=2.0 * (float(levels.negative_log_likelihoods(power).sum()) - linear.cost),
-        degrees=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
+        degrees_of_freedom=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
         misfit_of_gains=_misfit_of_gains(record, plain, gain),
     )
     if not fit.is_rigid:
         solution = _solve_rigid_fit(record, solution.state, one_weight=True)
-        fit = replace(fit, state=solution.state, one_weight=True)
-    return replace(fit, covariance=_covariance(record, solution, fit.deviation_inflation, gain))
+        fit = replace(fit, state=solution.state)
+    covariance = _parameter_covariance(record, solution, fit.deviation_inflation, gain)
+    return replace(fit, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class _FitData:
-    Z: Array
-    Q: Array
+    moments: Array
+    noise_moments: Array
     levels: NoiseLevels
     free: NDArray[np.bool_]
     power: Array
@@ -179,44 +181,49 @@ class _FitData:
 @dataclass(frozen=True, eq=False)
 class _RigidSolution:
     state: RigidParameters
-    B: Array
-    W: Array
-    inverse: Array
-    R: Array
+    derivative: Array
+    weights: Array
+    inverse_gram: Array
+    residual_covariances: Array
     undetermined: NDArray[np.bool_]
 
 
 def _solve_rigid_fit(
     record: _FitData, state: RigidParameters, *, one_weight: bool = False
 ) -> _RigidSolution:
-    sizes, clean = record.levels.sizes, record.Z - record.Q
+    sizes, clean = record.levels.sizes, record.moments - record.noise_moments
     R = _residual_covariances(record, state, record.power * sizes[:, None])
     for _ in range(_MAX_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
         if one_weight:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
-        B, Le = _residual_derivative(state)
+        B, Le = _residual_and_derivative(state)
         gram, right = _normal_equations(B, Le, clean, W)
         inverse, undetermined = _inverse_of_free_parameters(gram, record.free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_PARAMETER_STEP / np.maximum(np.abs(step), 1e-300))))
         state = _apply_step(state, step)
-        used = _used_degrees_of_freedom(B, record.Z, W, inverse)
-        R = _residual_covariances(record, state, _residual_sums(record, state), used)
+        used = _used_degrees_of_freedom(B, record.moments, W, inverse)
+        R = _residual_covariances(record, state, _residual_channel_powers(record, state), used)
         if np.max(np.abs(step) / size) < _CONVERGENCE_TOLERANCE:
             break
     return _RigidSolution(state, B, W, inverse, R, undetermined)
 
 
-def _covariance(record: _FitData, solution: _RigidSolution, inflation: float, gain: float) -> Array:
-    B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
-    middle = _normal_equations(B, np.zeros((6, MOMENTS_SIZE)), record.Z, W @ solution.R @ W)[0]
+def _parameter_covariance(
+    record: _FitData, solution: _RigidSolution, inflation: float, gain: float
+) -> Array:
+    inverse, undetermined = solution.inverse_gram, solution.undetermined
+    W, none = solution.weights, np.zeros((6, MOMENTS_SIZE))
+    W = W @ solution.residual_covariances @ W
+    middle = _normal_equations(solution.derivative, none, record.moments, W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
     if gain:
-        effects = gain * _gain_effects(B, record.Z - record.Q, W, inverse)
+        clean = record.moments - record.noise_moments
+        effects = gain * _parameter_errors_of_unit_gains(solution, clean)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -227,10 +234,12 @@ def _covariance(record: _FitData, solution: _RigidSolution, inflation: float, ga
 
 
 def _weight_estimation_factors(record: _FitData, solution: _RigidSolution) -> Array:
-    levels, B = record.levels, solution.B
-    half = np.einsum("cjk,ji->cik", B, solution.inverse)
-    weight = np.diagonal(solution.W, axis1=1, axis2=2)
-    part = np.einsum("cik,bkm,cim->bci", half, record.Z, half, optimize=True) * weight[..., None]
+    levels, B = record.levels, solution.derivative
+    half = np.einsum("cjk,ji->cik", B, solution.inverse_gram)
+    weight = np.diagonal(solution.weights, axis1=1, axis2=2)
+    part = (
+        np.einsum("cik,bkm,cim->bci", half, record.moments, half, optimize=True) * weight[..., None]
+    )
     part = levels.sums_over_groups(part).reshape(-1, NUM_PARAMETERS)
     share = part / np.maximum(part.sum(axis=0), 1e-300)
     freedom = np.repeat(2.0 * levels.sums_over_groups(levels.sizes), 6)
@@ -238,8 +247,8 @@ def _weight_estimation_factors(record: _FitData, solution: _RigidSolution) -> Ar
 
 
 def _motion_map_with_delay(state: RigidParameters) -> Array:
-    M = motion_transformation_matrix(state.R, state.r)
-    return np.hstack([M, state.tau * M[:, :NUM_MOTION_SIGNALS]])
+    M = motion_transformation_matrix(state.R_PS, state.p_PoSo_P)
+    return np.hstack([M, state.delay_s * M[:, :NUM_MOTION_SIGNALS]])
 
 
 def _residual_coefficients(state: RigidParameters) -> Array:
@@ -248,16 +257,16 @@ def _residual_coefficients(state: RigidParameters) -> Array:
     return L
 
 
-def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
+def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and e (6, 38): coefficients of 38 signals in the residual."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
     B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
-    B[:, LOAD_PARAMETERS] = regressor_coefficients() @ M
+    B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
-        lever = _motion_map_with_delay(replace(state, r=state.r + unit)) - M
+        lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
         ahead, behind = (
-            _motion_map_with_delay(replace(state, R=_rotate_by_vector(state.R, x * unit)))
+            _motion_map_with_delay(replace(state, R_PS=_rotate_by_vector(state.R_PS, x * unit)))
             for x in (_ROTATION_STEP_RAD, -_ROTATION_STEP_RAD)
         )
         B[:, 17 + i] = -L @ lever
@@ -286,24 +295,24 @@ def _inverse_of_free_parameters(
     return (basis / values[kept]) @ basis.T, free & (~used | null)
 
 
-def _residual_powers(Z: Array, state: RigidParameters) -> Array:
+def _residual_cross_powers(Z: Array, state: RigidParameters) -> Array:
     Le = _residual_coefficients(state) @ _motion_map_with_delay(state)
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _residual_sums(record: _FitData, state: RigidParameters) -> Array:
-    return np.asarray(np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2))
+def _residual_channel_powers(record: _FitData, state: RigidParameters) -> Array:
+    return np.asarray(np.diagonal(_residual_cross_powers(record.moments, state), axis1=1, axis2=2))
 
 
 def _residual_covariances(
     record: _FitData, state: RigidParameters, sums: Array, used: Array | None = None
 ) -> Array:
     levels, sizes = record.levels, record.levels.sizes[:, None]
-    P = _residual_powers(record.Q, state) / sizes[..., None]
+    P = _residual_cross_powers(record.noise_moments, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _MIN_OWN_NOISE_SHARE * levels.noise_power(sums, used),
-        rounding_error_power(record.Z, levels.sizes),
+        _MIN_WRENCH_NOISE_SHARE * levels.noise_power(sums, used),
+        rounding_error_power(record.moments, levels.sizes),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
@@ -316,35 +325,34 @@ def _used_degrees_of_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Ar
     return np.asarray(np.clip(gram * diagonal, 0.0, None))
 
 
-def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, FORCE_COLUMNS].reshape(
-        len(Z), 6, NUM_PARAMETERS, 6
-    )
-    return parameter_errors_by_gains(BF, W, inverse)
+def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:
+    BF = (solution.derivative.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, WRENCH_COLUMNS]
+    BF = BF.reshape(len(Z), 6, NUM_PARAMETERS, 6)
+    return parameter_errors_by_gains(BF, solution.weights, solution.inverse_gram)
 
 
 def _misfit_of_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
     if gain == 0.0:
         return 0.0
-    B, levels = solution.B, record.levels
-    effects = _gain_effects(B, record.Z, solution.W, solution.inverse)
+    B, levels = solution.derivative, record.levels
+    effects = _parameter_errors_of_unit_gains(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
     for c in range(6):
-        left[c, c, :, FORCE_COLUMNS] += np.diag(length[c] / length)
+        left[c, c, :, WRENCH_COLUMNS] += np.diag(length[c] / length)
     left = left.reshape(6, 36, MOMENTS_SIZE)
-    sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.Z, left, optimize=True)
+    sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.moments, left, optimize=True)
     more = levels.noise_power(np.maximum(sums, 0.0)) / record.power
     return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 
 
 def _apply_step(state: RigidParameters, step: Array) -> RigidParameters:
     return RigidParameters(
-        state.theta + step[LOAD_PARAMETERS],
-        state.tau + float(step[16]),
-        state.r + step[LEVER_PARAMETERS],
-        Rotation.from_matrix(_rotate_by_vector(state.R, step[ROTATION_PARAMETERS])).as_matrix(),
+        state.theta + step[OFFSET_AND_LOAD_PARAMETERS],
+        state.delay_s + float(step[16]),
+        state.p_PoSo_P + step[LEVER_PARAMETERS],
+        Rotation.from_matrix(_rotate_by_vector(state.R_PS, step[ROTATION_PARAMETERS])).as_matrix(),
     )
 
 
@@ -360,23 +368,23 @@ class UnitsAndAxes:
     """Units, axes and masses that the fit of a linear model of the wrench implies.
 
     Attributes:
-        kappa: unit error of position; 1e-3 for mm described as m.
-        kappa_deviation: its standard deviation; inf if undetermined.
-        deviation: largest standard deviation of M_g (3, 3) [kg], force over minus gravity.
+        position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
+        position_unit_deviation: its standard deviation; inf if undetermined.
+        max_mass_deviation_kg: largest standard deviation of M_g (3, 3), force over minus gravity.
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
-        masses: (3,) singular values of M_g [kg].
+        axis_masses_kg: (3,) singular values of M_g [kg].
     """
 
-    kappa: float
-    kappa_deviation: float
-    deviation: float
+    position_unit_ratio: float
+    position_unit_deviation: float
+    max_mass_deviation_kg: float
     R_SP: Array
-    masses: Array
+    axis_masses_kg: Array
 
     @property
     def is_usable(self) -> bool:
         """Whether M_g, force over minus gravity, is known to 5 % of the mass."""
-        return bool(self.deviation < 0.05 * self.masses.mean())
+        return bool(self.max_mass_deviation_kg < 0.05 * self.axis_masses_kg.mean())
 
     @property
     def is_mirrored(self) -> bool:
@@ -384,7 +392,7 @@ class UnitsAndAxes:
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
-def read_units_and_axes(fit: LinearFit) -> UnitsAndAxes:
+def estimate_units_and_axes(fit: LinearFit) -> UnitsAndAxes:
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _position_unit_ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])

@@ -11,6 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.load.moments import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
     NUM_MOTION_SIGNALS,
     PoseSplines,
@@ -23,14 +24,14 @@ MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
 TAPER_RAMP_S = 1.0
 """Length of the taper's ramps at the ends of the record [s]."""
-EXCLUSION_EDGE_S = 0.2
+EXCLUSION_RAMP_S = 0.2
 """Length of the taper's ramps beside excluded samples [s]."""
 _GRID_RATE_HZ = 100.0
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
-FORCE_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
+WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
 """Columns of the wrench and of the signals' derivatives in the moments."""
 SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, 2 * NUM_MOTION_SIGNALS + 6)
 MOMENTS_SIZE = 2 * NUM_MOTION_SIGNALS + 6
@@ -42,13 +43,13 @@ class WrenchGrid:
 
     Attributes:
         wrench: (N, 6) samples, N = M stride.
-        load: (6, 16) coefficients of an identified load, or None.
+        known_load: (6, 16) coefficients of an identified load, or None.
     """
 
     t: Array
     wrench: Array
     stride: int
-    load: Array | None = None
+    known_load: Array | None = None
 
     @classmethod
     def from_samples(cls, t: Array, wrench: Array, load: Array | None = None) -> WrenchGrid:
@@ -133,7 +134,7 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance_to_flag(lost) * dt - margin) / EXCLUSION_EDGE_S, 0.0, 1.0)
+    edge = np.clip((distance_to_flag(lost) * dt - margin) / EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
@@ -189,17 +190,20 @@ def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complex
 
 
 def second_moments(
-    zeta: ComplexArray, wrench: ComplexArray, of: FrequencyBands, rates: ComplexArray | None = None
+    zeta: ComplexArray,
+    wrench: ComplexArray,
+    bands: FrequencyBands,
+    rates: ComplexArray | None = None,
 ) -> Array:
     """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 
     They are sums of Re y* y^T; (bands, 22, 22) without `rates`, the spectra of d zeta/dt.
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
-    y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
-    starts = np.searchsorted(of.band, np.arange(of.count + 1))
-    out = np.empty((of.count, y.shape[1], y.shape[1]))
-    for k in range(of.count):
+    y = np.hstack(parts) * np.sqrt(bands.weight)[:, None]
+    starts = np.searchsorted(bands.band, np.arange(bands.count + 1))
+    out = np.empty((bands.count, y.shape[1], y.shape[1]))
+    for k in range(bands.count):
         # Real and imaginary parts as rows need only one real product per band.
         part = y[starts[k] : starts[k + 1]].view(np.float64).reshape(-1, y.shape[1], 2)
         part = part.transpose(0, 2, 1).reshape(-1, y.shape[1])
@@ -207,7 +211,7 @@ def second_moments(
     return out
 
 
-_MIN_REMAINING_SHARE = 0.25
+_MIN_REMAINING_DEGREES_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +228,9 @@ class NoiseLevels:
     shape: Array
 
     @classmethod
-    def white_within_groups(cls, of: FrequencyBands) -> NoiseLevels:
+    def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
         """Return levels of noise that is white within each group of bands."""
-        return cls(of.sizes, of.group, np.ones((of.count, 6)))
+        return cls(bands.sizes, bands.group, np.ones((bands.count, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
@@ -236,7 +240,8 @@ class NoiseLevels:
         remaining = self.sums_over_groups(self.sizes)[:, None]
         if used is not None:
             remaining = np.maximum(
-                remaining - 0.5 * self.sums_over_groups(used), _MIN_REMAINING_SHARE * remaining
+                remaining - 0.5 * self.sums_over_groups(used),
+                _MIN_REMAINING_DEGREES_SHARE * remaining,
             )
         level = np.add.reduceat(sums / self.shape, self._first_bands_of_groups, axis=-2) / remaining
         return np.asarray(level[..., self.group, :] * self.shape)
@@ -253,10 +258,10 @@ class NoiseLevels:
         return np.asarray(self.sizes @ np.log(power))
 
 
-def random_walk_shape(of: FrequencyBands, corner: float) -> Array:
+def random_walk_shape(bands: FrequencyBands, corner: float) -> Array:
     """Return the mean (bands,) of 1 + (corner / f)^2 in each band, Eq. (T74)."""
-    f = np.maximum(of.frequency, of.frequency[1])
-    return np.asarray(1.0 + of.sums_over_bands((corner / f) ** 2) / of.sizes)
+    f = np.maximum(bands.frequency, bands.frequency[1])
+    return np.asarray(1.0 + bands.sums_over_bands((corner / f) ** 2) / bands.sizes)
 
 
 OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
@@ -269,22 +274,22 @@ def noise_moments(
     grid: WrenchGrid,
     taper: Array,
     zeta: Array,
-    of: FrequencyBands,
+    bands: FrequencyBands,
     noise: tuple[float, float],
 ) -> Array:
     """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `second_moments`.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """
-    w2 = (2.0 * np.pi * of.frequency) ** 2
+    w2 = (2.0 * np.pi * bands.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
-    share = per_number * passed_noise_share(of.frequency, splines.spacing)
+    share = per_number * passed_noise_share(bands.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
-        left = splines.imu_rows.remaining_noise_shares(of.frequency)
+        left = splines.imu_rows.remaining_noise_shares(bands.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
-    still, first, second, third = _rotation_covariances(zeta, weight)
+    still, first, second, third = _signal_covariances_by_rotation(zeta, weight)
     eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
     parts = [
@@ -293,18 +298,20 @@ def noise_moments(
         (rotation_power * w2, first + second),
     ]
     parts.append((rotation_power * w2**2, third))
-    Q = np.zeros((of.count, MOMENTS_SIZE, MOMENTS_SIZE))
+    Q = np.zeros((bands.count, MOMENTS_SIZE, MOMENTS_SIZE))
     for power, shape in parts:
         Q[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS] += (
-            of.sums_over_bands(power)[:, None, None] * shape
+            bands.sums_over_bands(power)[:, None, None] * shape
         )
         Q[:, SIGNAL_RATE_COLUMNS, SIGNAL_RATE_COLUMNS] += (
-            of.sums_over_bands(power * w2)[:, None, None] * shape
+            bands.sums_over_bands(power * w2)[:, None, None] * shape
         )
     return Q
 
 
-def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
+def _signal_covariances_by_rotation(
+    zeta: Array, weight: Array
+) -> tuple[Array, Array, Array, Array]:
     still, cross, products, alpha = np.zeros((4, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     mean = weight @ zeta
     for left in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
@@ -315,14 +322,8 @@ def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Arr
     for where in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
         cross[where, _ALPHA_COLUMNS] = -cross_matrix(mean[where])
         cross[_ALPHA_COLUMNS, where] = cross[where, _ALPHA_COLUMNS].T
-    jacobian = np.zeros(
-        (3, 3, NUM_MOTION_SIGNALS)
-    )  # derivative of the signals by omega_j, coefficient of omega_i
-    for i in range(3):
-        for j in range(3):
-            jacobian[j, i, OMEGA_PRODUCT_COLUMNS[i, j]] += 1.0 + (i == j)
     ww = mean[OMEGA_PRODUCT_COLUMNS]
-    for k in range(3):
-        products += jacobian[k].T @ ww @ jacobian[k]
+    for jacobian in omega_product_jacobians(OMEGA_PRODUCT_COLUMNS, NUM_MOTION_SIGNALS):
+        products += jacobian.T @ ww @ jacobian
     alpha[_ALPHA_COLUMNS, _ALPHA_COLUMNS] = np.eye(3)
     return still, cross, products, alpha

@@ -19,14 +19,14 @@ MIN_POSES_PER_KNOT = 2.0
 """Least average number of poses between two knots."""
 NUM_MOTION_SIGNALS = 16
 """Number of columns of `PoseSplines.signals`."""
-GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
+GRAVITY_COLUMNS, COLUMNS_ZERO_AT_REST = slice(4, 7), [1, 2, 3, *range(7, 16)]
 """Columns of gravity, and columns that are zero at rest."""
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
 _LIMITED_DERIVATIVES = range(1, 5)  # of derivatives at the ends
 # Largest weight of the penalty or of a limit over that of the poses; rounding allows no more.
-_MAX_WEIGHT_RATIO = 1e12
+_MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,13 @@ class ImuSplineRows:
         acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
         quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
         pose_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
-        own_powers: noise power densities of acceleration and angular velocity.
+        imu_powers: noise power densities of acceleration and angular velocity.
     """
 
     t: Array
     rate: float
     pose_powers: tuple[float, float]
-    own_powers: tuple[float, float]
+    imu_powers: tuple[float, float]
     acceleration_W: Array | None = None
     quaternion_rate: Array | None = None
 
@@ -68,7 +68,7 @@ class ImuSplineRows:
         left = []
         for pose, own, order, rows in zip(
             self.pose_powers,
-            self.own_powers,
+            self.imu_powers,
             (4, 2),
             (self.acceleration_W, self.quaternion_rate),
             strict=True,
@@ -124,7 +124,7 @@ class PoseSplines:
             (2, 1),
             (imu_rows.acceleration_W, imu_rows.quaternion_rate),
             imu_rows.pose_powers,
-            imu_rows.own_powers,
+            imu_rows.imu_powers,
             strict=True,
         ):
             band, side = gram, right[:, part]
@@ -143,7 +143,7 @@ class PoseSplines:
         root = diags_array(np.sqrt(np.diff(knots[SPLINE_DEGREE:-SPLINE_DEGREE])))
         root = root @ _derivative_map(knots, SPLINE_DEGREE)
         penalty = _upper_band((root.T @ root).tocsr())
-        largest = _MAX_WEIGHT_RATIO * gram[-1].max()
+        largest = _MAX_PENALTY_OVER_POSE_WEIGHT * gram[-1].max()
         lowest = (self.rate * penalty[-1].max() / largest) ** (0.5 / SPLINE_DEGREE) / (2 * np.pi)
         coefficients = np.empty_like(right)
         for part in (slice(0, 3), slice(3, 7)):
@@ -193,13 +193,13 @@ class PoseSplines:
 
     def quaternion(self, t: Array) -> Array:
         """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""
-        return np.asarray(self._spline_derivative(t, 0)[:, 3:])
+        return np.asarray(self._evaluate_derivative(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
         """Return positions (N, 3) of Po in the world at times t [m]."""
-        return np.asarray(self._spline_derivative(t, 0)[:, :3])
+        return np.asarray(self._evaluate_derivative(t, 0)[:, :3])
 
-    def _spline_derivative(self, t: Array, order: int) -> Array:
+    def _evaluate_derivative(self, t: Array, order: int) -> Array:
         at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
         return np.asarray(self._spline(at, order))
 
@@ -238,7 +238,7 @@ class PoseSplines:
         return out[0], out[1], out[2], out[3]
 
     def _motion_at(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        x, first, second = (self._spline_derivative(t, order) for order in range(3))
+        x, first, second = (self._evaluate_derivative(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
         omega = 2.0 * _vector_part_of_relative_quaternion(q, qd) / n
@@ -263,12 +263,12 @@ class PoseSplines:
             turn = 2.0 * _vector_part_of_relative_quaternion(
                 fitted[:, 3:], self.poses.quaternion[part]
             )
-            powers = self._noise_powers(position), self._noise_powers(turn)
+            powers = self._powers_in_noise_band(position), self._powers_in_noise_band(turn)
             sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
         position_std, rotation_std = np.sqrt(sums / count)
         return float(position_std), float(rotation_std)
 
-    def _noise_powers(self, residual: Array) -> Array:
+    def _powers_in_noise_band(self, residual: Array) -> Array:
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
         low, high = (share / self.spacing for share in _NOISE_BAND_OVER_KNOT_RATE)
@@ -281,7 +281,7 @@ class SplineCache:
 
     def __init__(self, poses: Poses, imu_rows: ImuSplineRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
-        self._fit_spline: dict[float, PoseSplines] = {}
+        self._splines_by_spacing: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
@@ -289,9 +289,9 @@ class SplineCache:
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def splines_with_spacing(self, spacing: float) -> PoseSplines:
-        if spacing not in self._fit_spline:
-            self._fit_spline[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
-        return self._fit_spline[spacing]
+        if spacing not in self._splines_by_spacing:
+            self._splines_by_spacing[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
+        return self._splines_by_spacing[spacing]
 
 
 def passed_noise_share(frequency: Array, spacing: float) -> Array:

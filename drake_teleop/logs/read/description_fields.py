@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
 
-from drake_teleop.common.rotations import nearest_rotation, rotation_error
+from drake_teleop.common.rotations import nearest_rotation, orthogonality_error
 
 ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
@@ -63,7 +63,7 @@ def _parse_frame(value: Any) -> Any:
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
         raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
-    if not (np.abs(matrix) < 2.0).all() or rotation_error(matrix) > ROTATION_TOLERANCE:
+    if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
 

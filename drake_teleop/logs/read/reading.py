@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
-from drake_teleop.common.rotations import nearest_rotation, quaternions_of, rotation_matrices
+from drake_teleop.common.rotations import (
+    nearest_rotation,
+    quaternions_from_matrices,
+    rotation_matrices,
+)
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW_OVER_PERIOD,
@@ -258,7 +262,7 @@ class _LogReader:
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
                     R_WS = R_WS @ stream.R_SP.T
-                    q = quaternions_of(R_WS)
+                    q = quaternions_from_matrices(R_WS)
                 if position is not None:  # from Po to So
                     position[part] -= R_WS @ origin
             quaternion[part] = q

@@ -13,8 +13,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import (
     NUM_COLUMNS_OF_FORM,
     nearest_rotation,
-    quaternions_of,
-    rotation_error,
+    orthogonality_error,
+    quaternions_from_matrices,
     rotation_matrices,
 )
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
@@ -116,13 +116,13 @@ class OrientationColumns:
         """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
         orientation = self._orientation
         R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_errors(rotation_error(R), rows)
+        self._check_errors(orthogonality_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
-            return quaternions_of(self.rotations(rows))
+            return quaternions_from_matrices(self.rotations(rows))
         q = self._columns[rows]
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)

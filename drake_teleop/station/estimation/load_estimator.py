@@ -163,7 +163,7 @@ class LoadEstimator(LeafSystem):
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
         due = self._watches and round(time / self._period) % _SAMPLES_PER_SETTLING_CHECK == 0
-        if due and self._estimator.is_settled_at(estimate, memory):
+        if due and self._estimator.is_state_settled(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
@@ -175,5 +175,5 @@ class LoadEstimator(LeafSystem):
         output[0] = self._load_state_index(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
-            settled = self._estimator.is_settled_at(estimate, memory.reshape(self._shape))
+            settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))
             output[0] = STATE_SETTLED if settled else STATE_LEARNING

@@ -25,7 +25,7 @@ from drake_teleop.common.vectors import (
     plus,
     quaternion_of_matrix,
     scale_vector,
-    symmetric_at,
+    symmetric_matrix_at,
     transposed,
     vector_at,
 )
@@ -239,7 +239,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
-    R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_at(phi, 4)
+    R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     s, omega, alpha = (
         apply_matrix(R_LW, vector_at(x, 0)),
         apply_matrix(R_LW, vector_at(x, 3)),
@@ -307,7 +307,11 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add inertial parameters phi (10,) of a link about Wo, in W, to `inertia` (10,)."""
     phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
-    m, h, about_Lo = phi[0], apply_matrix(matrix_at(x, 12), vector_at(phi, 1)), symmetric_at(phi, 4)
+    m, h, about_Lo = (
+        phi[0],
+        apply_matrix(matrix_at(x, 12), vector_at(phi, 1)),
+        symmetric_matrix_at(phi, 4),
+    )
     inertia[0] += m
     add_into(inertia, 1, plus(h, scale_vector(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
@@ -347,7 +351,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         v, w = vector_at(link[row], 6), vector_at(link[row], 9)
         # Momentum about Wo of all outboard links for unit speed of this joint.
         linear = add_cross_product(scale_vector(c[0], v), w, h)
-        angular = add_cross_product(apply_matrix(symmetric_at(c, 4), w), h, v)
+        angular = add_cross_product(apply_matrix(symmetric_matrix_at(c, 4), w), h, v)
         # `solve_positive_definite` reads the lower half only.
         for i in range(row + 1):
             v, w = vector_at(link[i], 6), vector_at(link[i], 9)

@@ -21,7 +21,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_of
+from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_kinematics, pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
@@ -356,7 +356,7 @@ class Arm:
         """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self.table, q, R_WS, p_WS)
-        return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
+        return np.concatenate([quaternions_from_matrices(R_WS[None])[0], p_WS])
 
 
 def arm_of_model_file(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
