@@ -18,10 +18,15 @@ from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
-from drake_teleop.logs.read.alignment import white_noise
-from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream
+from drake_teleop.logs.read.alignment import white_noise_deviations
+from drake_teleop.logs.read.bags import (
+    draft_bag_description,
+    is_bag,
+    list_topics,
+    read_stream_table,
+)
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import min_gap_length, time_stamps_s
+from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_episodes
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -83,7 +88,7 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
             for topic in topics
         }
-        return Draft(*draft_of_bag(path, topics, out))
+        return Draft(*draft_bag_description(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
         raise DrakeTeleopError(
             "a log description names all files of a recording, so that no others can be added",
@@ -145,7 +150,7 @@ def _inspect_described_log(
         if stream is None:
             continue
         if stream.source not in tables:
-            tables[stream.source] = read_stream(stream)
+            tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_numbers(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
@@ -181,7 +186,7 @@ def _inspect_stream(
         for field in _QUANTITY_NAMES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
-    values = table.raw_side_by_side(columns, f"{source}:{name}")
+    values = table.numbers_with_nan_side_by_side(columns, f"{source}:{name}")
     good = np.asarray(np.isfinite(values).all(axis=1))
     findings: list[Finding] = []
     figures: dict[str, Any] = {"rows": len(values)}
@@ -214,7 +219,7 @@ def _inspect_stream(
             "min": float(finite.min()),
             "max": float(finite.max()),
             "mean": float(finite.mean()),
-            "noise": float(white_noise(finite[:, None])[0]),
+            "noise": float(white_noise_deviations(finite[:, None])[0]),
             "saturated": saturated,
         }
         if saturated:
@@ -257,7 +262,7 @@ def _inspect_clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
-    stamps, figures["episodes"] = time_stamps_s(time, table, at)
+    stamps, figures["episodes"] = time_stamps_and_episodes(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)
     usable[1:] &= stamps[1:] > highest[:-1]
@@ -270,7 +275,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length(median, BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length_s(median, BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,

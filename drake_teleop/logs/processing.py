@@ -28,15 +28,15 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import read_aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
     check_file,
     check_suspicious_load,
-    findings_about_motion,
+    motion_findings,
 )
-from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
+from drake_teleop.logs.check.corrections import FINDINGS_CAUSED_BY_MISFIT, Finding
 from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
@@ -56,8 +56,8 @@ from drake_teleop.logs.explained_log import (
 )
 from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
-    choose_delay,
     far_from_gaps,
+    given_or_estimated_delay,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -199,7 +199,7 @@ def _identify_read_log(
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:
-        delay_s, source = choose_delay(log, cutoff_hz, delay)
+        delay_s, source = given_or_estimated_delay(log, cutoff_hz, delay)
         log = remove_delay(log, delay_s)
         log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
@@ -227,7 +227,7 @@ def _identify_read_log(
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
-        errors = findings_about_motion(check)
+        errors = motion_findings(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -235,7 +235,7 @@ def _identify_read_log(
     if why is not None:
         result = explained_load(result, why)
         causes = replace_frame_causes(why, other[0]) if other else why.causes
-    note = fit.note if not causes or (why is not None and why.several_gains) else ""
+    note = fit.note if not causes or (why is not None and why.has_several_gains) else ""
     if raw.free and why is not None:
         note = removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
@@ -291,9 +291,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
-    if identified.causes and all(
-        finding.name in POSSIBLE_EFFECTS_OF_CAUSES for finding in findings
-    ):
+    if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
         )
@@ -560,7 +558,7 @@ def _find_suspected_errors(
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()
-    ignored = {"lag", "payload", *TEMPORARY_CAUSES}
+    ignored = {"lag", "payload", *CAUSES_WITHOUT_CORRECTION}
     if load.weight_removed:
         ignored |= {"weight removed", "payload configured"}
     return tuple(x for x in check_log(path).findings if x.name not in ignored)

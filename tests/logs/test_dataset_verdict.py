@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from test_dataset import log_of
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import faults_of_hypothesis, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     Hypothesis,
@@ -48,7 +48,7 @@ FLIP = np.diag([1.0, -1.0, 1.0])
     ],
 )  # fmt: skip
 def test_findings_contain_figures_and_units(change, expected):
-    found = name_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
+    found = faults_of_hypothesis(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message
@@ -122,14 +122,14 @@ def test_step_of_the_offsets_is_found_inside_the_episode(step, at, found, channe
 def test_frames_at_an_end_of_the_range_are_counted(rows, saturated, side):
     wrench = np.random.default_rng(2).normal(size=(100, 6))
     wrench[20 : 20 + rows, 4] = 9.0 * side
-    found = saturated_channels(wrench)
+    found = saturation_faults(wrench)
     assert [f.message for f in found] == (
         [f"channels stay at the end of their range: tau_y for {rows} frames"] if saturated else []
     )
     wrench[50 : 50 + rows, 4] = 0.5  # a coarse step that lasts as long
-    assert saturated_channels(wrench) == []
+    assert saturation_faults(wrench) == []
     wrench[:, 1] = 2.0
-    assert saturated_channels(wrench)[0].name == "dead channel"
+    assert saturation_faults(wrench)[0].name == "dead channel"
 
 
 @pytest.mark.parametrize("lag", [0.0, 2.5, -3.0, 0.37])

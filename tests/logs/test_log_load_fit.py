@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.against_load import LoadFit, fit_load
-from drake_teleop.logs.read.alignment import white_noise
+from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.canonical import Log
 
 
@@ -18,9 +18,9 @@ def test_white_noise_is_seen_under_a_smooth_motion() -> None:
     rng, sigma = np.random.default_rng(4), np.array([0.02, 0.3, 1.5])
     t = np.arange(0, 20, 1e-3)[:, None]
     motion = 20 * np.sin(2 * np.pi * np.array([0.5, 1.0, 2.0]) * t)
-    found = white_noise(motion + sigma * rng.normal(size=(len(t), 3)))
+    found = white_noise_deviations(motion + sigma * rng.normal(size=(len(t), 3)))
     np.testing.assert_allclose(found, sigma, rtol=0.05)
-    assert not white_noise(motion[:3]).any()
+    assert not white_noise_deviations(motion[:3]).any()
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.0])

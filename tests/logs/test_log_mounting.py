@@ -205,10 +205,10 @@ def test_wrench_is_used_if_it_determines_more_coordinates_than_the_pose(
     monkeypatch.setattr(auto_frames, "lever_arm_from_wrench", lambda _: other)
     of_the_pose: Any = SimpleNamespace(fits_pose=True, lever=of_pose)
     if taken == "wrench":
-        assert auto_frames._choose_lever_arm(of_the_pose, None, "here") is other
+        assert auto_frames._lever_arm_from_pose_or_wrench(of_the_pose, None, "here") is other
         return
     with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
-        auto_frames._choose_lever_arm(of_the_pose, None, "here")
+        auto_frames._lever_arm_from_pose_or_wrench(of_the_pose, None, "here")
 
 
 def test_contact_prevents_a_lever_arm_from_the_wrench() -> None:

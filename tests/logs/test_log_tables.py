@@ -17,7 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import read_table
-from drake_teleop.logs.read.tables import decimal_step
+from drake_teleop.logs.read.tables import decimal_resolution
 
 
 def write(path: Path, text: str) -> Path:
@@ -301,7 +301,7 @@ def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -
 def test_decimal_step_is_the_quantization_of_printed_numbers(
     values: list[float], step: float
 ) -> None:
-    assert decimal_step(np.array(values)) == pytest.approx(step)
+    assert decimal_resolution(np.array(values)) == pytest.approx(step)
 
 
 PLAIN = "t,a\n0,1.5\n1,2.5\n"

@@ -39,7 +39,11 @@ from drake_teleop.logs.dataset.dataset_files import (
     open_dataset,
     write_copy,
 )
-from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import (
+    EpisodeFault,
+    faults_of_hypothesis,
+    saturation_faults,
+)
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
@@ -67,8 +71,8 @@ _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_FRAMES = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
-_CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES = (
+_MAX_EXCESS_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = (
     2,
     20,
 )  # frames around contact; free frames for the offsets
@@ -337,8 +341,8 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
     predict = signals.reading_predictor(shared.phi)
     found = find_hypothesis(predict, signals.regressor_at_lag, shared.lag, shared.typical)
     residual = unexplained_reading(found, predict, signals.regressor_at_lag)
-    faults: list[EpisodeFault] = saturated_channels(log.wrench)
-    faults += name_faults(found, shared.lag, shared.phi, 1.0 / log.dt)
+    faults: list[EpisodeFault] = saturation_faults(log.wrench)
+    faults += faults_of_hypothesis(found, shared.lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
     if step is not None:
@@ -351,7 +355,7 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         shared.typical
     )
     spread -= np.log(found.gain).repeat(3)
-    if not faults and spread.mean() > _MAX_EXCESS_SPREAD:
+    if not faults and spread.mean() > _MAX_EXCESS_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
@@ -381,7 +385,7 @@ def _contact_wrench_and_flags(
         detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
         free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
-        if free.sum() < _MIN_FREE_FRAMES:
+        if free.sum() < _MIN_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)
     return contact, touched

@@ -30,17 +30,17 @@ HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
-_FORCE, _TORQUE = slice(0, 3), slice(3, 6)
-_BEST_ROWS_SHARE, _ITERATIONS = 0.6, 4
-_COST_PER_DEVIATION, _COST_FRAMES = (
+_FORCE_CHANNELS, _TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
+_REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
+_COST_PER_DEVIATION, _COST_TIMES_FRAMES = (
     0.25,
     40.0,
 )  # required reduction of the log spread, for each deviation
 _NUM_START_PARTS = 4
-_MIN_SPREAD_SHARE = 0.3
+_MIN_HALF_WIDTH_SHARE = 0.3
 _INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
-_FEWEST_STEP_FRAMES, _STEP_SHARE, _NUM_TRIED_STEPS = 12, 0.12, 20
-_NOISE_MARGIN = 1.5
+_MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
+_MAX_DEVIATION_OVER_NOISE = 1.5
 
 PredictReading = Callable[[str, float], tuple[Array, Array]]
 """Function of a kind and a lag [frames]: reading in the axes of S, and the load's wrench (N, 6)."""
@@ -103,7 +103,7 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _MIN_SPREAD_SHARE * typical)
+    search = HypothesisSearch(predict, regress, usual_lag, _MIN_HALF_WIDTH_SHARE * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
@@ -111,7 +111,7 @@ def find_hypothesis(
     for kind in HYPOTHESIS_KINDS:
         lags = {
             usual_lag,
-            search.best_lag(replace(usual, kind=kind)),
+            search.lag_of_least_spread(replace(usual, kind=kind)),
             search.lag_of_linear_fit(kind),
         }
         for lag in lags:
@@ -119,7 +119,9 @@ def find_hypothesis(
             found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
-        found.append(search.with_spread_and_cost(replace(best, lag=search.best_lag(best))))
+        found.append(
+            search.with_spread_and_cost(replace(best, lag=search.lag_of_least_spread(best)))
+        )
     return min(found, key=lambda x: x.cost)
 
 
@@ -140,7 +142,7 @@ class HypothesisSearch:
         self.predict, self.regress = predict, regress
         self.usual_lag, self.floor = usual_lag, floor
         self.frames = len(predict("sensor", usual_lag)[0])
-        self.price = _COST_PER_DEVIATION + _COST_FRAMES / self.frames
+        self.price = _COST_PER_DEVIATION + _COST_TIMES_FRAMES / self.frames
 
     def _reading_residual(self, x: Hypothesis) -> Array:
         return unexplained_reading(x, self.predict, self.regress)
@@ -157,7 +159,10 @@ class HypothesisSearch:
 
     def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
-        force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
+        force, torque = (
+            self.best_permutation(*both, channels)
+            for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
+        )
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
         yield self.with_spread_and_cost(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
@@ -205,12 +210,12 @@ class HypothesisSearch:
         self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
     ) -> Hypothesis:
         both = self.predict(x.kind, x.lag)
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_REFITS):
             w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
             if scale:
                 ratio = [
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in (_FORCE, _TORQUE)
+                    for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
                 ]
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
@@ -233,7 +238,7 @@ class HypothesisSearch:
     ) -> Hypothesis:
         x = hypothesis_without_fault(lag)
         weights = np.exp(-spread_and_centre_of_calm_half(wrench, self.floor)[0])
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_REFITS):
             w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
             A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
             size = np.linalg.norm(A, axis=0) + 1e-12
@@ -242,7 +247,7 @@ class HypothesisSearch:
             rows, weights = self._best_rows_of(x), np.exp(-x.spread)
         return x
 
-    def best_lag(self, x: Hypothesis) -> float:
+    def lag_of_least_spread(self, x: Hypothesis) -> float:
         """Return the lag [frames] with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
@@ -274,13 +279,13 @@ class HypothesisSearch:
 
 def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
     distance = (residual**2).sum(axis=1)
-    return np.asarray(distance <= np.quantile(distance, _BEST_ROWS_SHARE))
+    return np.asarray(distance <= np.quantile(distance, _REFITTED_ROWS_SHARE))
 
 
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
-    for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
+    for channels, factor in zip((_FORCE_CHANNELS, _TORQUE_CHANNELS), gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
         H += w[:, channels].T @ p[:, channels] * factor / size**2
     U, _, Vt = np.linalg.svd(H)
@@ -289,7 +294,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE, x.force), (_TORQUE, x.torque)):
+    for channels, M in ((_FORCE_CHANNELS, x.force), (_TORQUE_CHANNELS, x.torque)):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
@@ -320,8 +325,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (
         np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL
     )
-    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _NOISE_MARGIN * noise)
-    fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
+    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_DEVIATION_OVER_NOISE * noise)
+    fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
         centre = spread_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
@@ -330,7 +335,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     whole = inliers_and_centre(residual)[0].sum()
     best: tuple[int, int, Array, Array] | None = None
     jumps = np.linalg.norm(np.diff(residual, axis=0) / deviation, axis=1)
-    for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEPS]:
+    for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEP_FRAMES]:
         if not fewest <= k <= n - fewest:
             continue
         (first, before), (second, after) = (

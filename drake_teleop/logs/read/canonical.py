@@ -33,8 +33,8 @@ _KINEMATIC_COLUMNS = {
     "orientation": QUATERNION_COLUMNS,
     "position": POSITION_COLUMNS,
 }
-_MAX_REST_SPEED = 0.05  # rad/s
-_MIN_GRAVITY_ROTATION_RAD = np.radians(10.0)
+_MAX_REST_SPEED_RAD_S = 0.05  # rad/s
+_MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
 _ROW_SHAPES: dict[str, tuple[int, ...]] = {
     "t": (),
     "wrench": (6,),
@@ -230,7 +230,7 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if "angular_velocity" in fields:
         speed = table.numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
-        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
+        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED_RAD_S:
             return False
     if "t" not in table.columns:
         return True
@@ -248,4 +248,4 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         vertical = table.numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _MIN_GRAVITY_ROTATION_RAD)
+    return bool(np.quantile(turned, 0.8) > _MIN_TURN_BETWEEN_POSES_RAD)

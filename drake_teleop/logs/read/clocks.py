@@ -15,16 +15,16 @@ from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
-EPISODE_GAP_S = 1.0
+MIN_TIME_BETWEEN_EPISODES_S = 1.0
 """Least time between two episodes of a file [s]."""
 MIN_GAP_STEPS = 4.0
 """Least length of a gap in median steps."""
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
-_MAX_STEP_RATIO = 4.0
+_MAX_MEAN_OVER_MEDIAN_STEP = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
-_MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
+_MAX_EPISODE_START_OFFSET_STEPS, _MAX_STEP_AT_EPISODE_START_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
 _SMOOTHING_WINDOW_STAMPS = 50
 
 
@@ -58,8 +58,8 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
-        return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
-    t, episodes = time_stamps_s(time, table, where)
+        return Clock(_apply_clock_scale_and_offset(rows / time.rate, time), rows, table.rows)
+    t, episodes = time_stamps_and_episodes(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
@@ -67,7 +67,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
-        rows = _remove_repetitions(rows, t, table, columns, where)
+        rows = _remove_repeated_rows(rows, t, table, columns, where)
         if len(rows) < before:
             notes.append(
                 f"{before - len(rows)} rows that repeat the previous row and its time stamp"
@@ -84,12 +84,12 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             f" {np.abs(even - t).max():.2g} s"
         )
         t = even
-    _check_rate(t, time, where)
+    _check_rate_is_plausible(t, time, where)
     _check_stamps_are_even(t, rows, table, where)
-    return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
+    return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
-def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
+def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock.
@@ -107,7 +107,7 @@ def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
             where=f"{where}.unit",
             remedy="leave `unit` out",
         )
-    columns = whole.raw_side_by_side(names, f"{where}.column")
+    columns = whole.numbers_with_nan_side_by_side(names, f"{where}.column")
     t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
         t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
@@ -143,21 +143,23 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     if not len(back) or not (steps > 0.0).any():
         return t, 1
     step = float(np.median(steps[steps > 0.0]))
-    again = np.abs(known[back] - known[0]) <= _MAX_START_STEPS * step
+    again = np.abs(known[back] - known[0]) <= _MAX_EPISODE_START_OFFSET_STEPS * step
     if not again.all() or np.diff([0, *back, len(known)]).min() < _MIN_EPISODE_ROWS:
         return t, 1
     after = steps[back[:, None] + np.arange(_MIN_EPISODE_ROWS - 1)]
-    if (after > _MAX_FIRST_STEPS * step).any():  # one wrong stamp
+    if (after > _MAX_STEP_AT_EPISODE_START_STEPS * step).any():  # one wrong stamp
         return t, 1
     joined = known.copy()
     for start in back:
-        joined[start:] += joined[start - 1] + max(EPISODE_GAP_S, 10.0 * step) - joined[start]
+        joined[start:] += (
+            joined[start - 1] + max(MIN_TIME_BETWEEN_EPISODES_S, 10.0 * step) - joined[start]
+        )
     result = t.copy()
     result[finite] = joined
     return result, len(back) + 1
 
 
-def _to_common_clock(t: Array, time: Time) -> Array:
+def _apply_clock_scale_and_offset(t: Array, time: Time) -> Array:
     return t[:1] + time.scale * (t - t[:1]) + time.offset
 
 
@@ -173,11 +175,11 @@ def spread_shared_stamps(t: Array) -> Array:
 def find_gaps_in_times(t: Array, bandwidth_hz: float | None) -> Array:
     """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
-    at = np.flatnonzero(steps > min_gap_length(float(np.median(steps)), bandwidth_hz))
+    at = np.flatnonzero(steps > min_gap_length_s(float(np.median(steps)), bandwidth_hz))
     return np.stack([t[at], t[at + 1]], axis=1)
 
 
-def min_gap_length(step: float, bandwidth_hz: float | None) -> float:
+def min_gap_length_s(step: float, bandwidth_hz: float | None) -> float:
     """Return the least length of a gap [s]: four steps, and half a period of the bandwidth."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
@@ -204,7 +206,7 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     return line + smooth
 
 
-def _remove_repetitions(
+def _remove_repeated_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
     values = [table.raw(column, where) for column in columns]
@@ -245,7 +247,7 @@ def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where
         )
 
 
-def _check_rate(t: Array, time: Time, where: str) -> None:
+def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
     if len(t) < 2:
         return
     step = float(np.median(np.diff(t)))
@@ -269,13 +271,13 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
 
 def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
+    if len(t) < 3 or t[-1] - t[0] <= _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
     row = table.line_in_file(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s (at most {_MAX_STEP_RATIO:g} times that), longest"
+        f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that), longest"
         f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
         where=where,
         remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     import polars as pl
 
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
-_ROWS_FOR_TYPES = 1000  # rows from which column types are inferred
+_ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
 _UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
-_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_DECIMAL_COMMA_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
@@ -49,7 +49,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
         source = b"\n".join([b" ".join(line.split()) for line in aligned])
         rest = [" ".join(line.split()) for line in rest]
-    names = _names_in_comment(lines[:before], rest, separator) if header else None
+    names = _column_names_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
     parse = partial(
         pl.read_csv,
@@ -57,11 +57,15 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         has_header=header,
         separator=separator,
         decimal_comma=separator in ";\t"
-        and any(_DECIMAL_COMMA.fullmatch(cell) for line in rest for cell in line.split(separator)),
+        and any(
+            _DECIMAL_COMMA_PATTERN.fullmatch(cell)
+            for line in rest
+            for cell in line.split(separator)
+        ),
         skip_lines=before,
         try_parse_dates=True,
     )
-    frame = _parse_with_types(parse)
+    frame = _parse_with_inferred_types(parse)
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
@@ -76,24 +80,24 @@ def _normalize_separators_and_encoding(
     returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
     # "1,500" can be 1500.
     commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
-    if not (returns or commas or _content_length(tail) < len(tail)):
+    if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
     text = _LONE_CR_PATTERN.sub(b"\n", text) if returns else text
     text = _QUOTED_NUMBER_PATTERN.sub(rb"\1.\2", text) if commas else text
-    return text[: _content_length(text)]
+    return text[: _length_without_blank_end(text)]
 
 
-def _content_length(text: bytes) -> int:
+def _length_without_blank_end(text: bytes) -> int:
     line = text.find(b"\n", len(text.rstrip(_BLANK_BYTES)))
     return len(text) if line < 0 else line + 1
 
 
-def _parse_with_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
+def _parse_with_inferred_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):
-        frame = parse(infer_schema_length=_ROWS_FOR_TYPES)
+        frame = parse(infer_schema_length=_ROWS_FOR_TYPE_INFERENCE)
         if all(kind.is_numeric() for kind in frame.dtypes):
             return frame
     return parse(infer_schema_length=None)
@@ -106,7 +110,9 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+def _column_names_in_comment(
+    comments: list[str], rest: list[str], separator: str
+) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
     if not marked or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None

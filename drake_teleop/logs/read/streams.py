@@ -24,7 +24,7 @@ from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
-MAX_SIGNAL_VALUES = {
+MAX_PLAUSIBLE_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -64,11 +64,11 @@ def resample_to_clock(t: Array, stream: Stream, values: Array) -> Array:
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
-def world_to_S(R_WS: Array, vectors_W: Array) -> Array:
+def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
+def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
@@ -106,7 +106,7 @@ class OrientationColumns:
         width = NUM_COLUMNS_OF_FORM[orientation.form]
         self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.si_value(orientation.unit)
+            self._columns *= description.si_value_of_unit(orientation.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
         """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
@@ -116,7 +116,7 @@ class OrientationColumns:
         """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
         orientation = self._orientation
         R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_errors(rotation_error(R), rows)
+        self._check_rotation_errors(rotation_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
@@ -127,13 +127,13 @@ class OrientationColumns:
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
         squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
-        self._check_errors(np.abs(squared**2 - 1.0), rows)
+        self._check_rotation_errors(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
             q[:, 1:] *= -1.0
         return q
 
-    def _check_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
+    def _check_rotation_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
@@ -144,7 +144,7 @@ class OrientationColumns:
             )
 
 
-def common_time_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
+def uniform_times_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
     """Return uniform times at the wrench's rate, within the time spans of all streams."""
     start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
     stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])

@@ -73,7 +73,7 @@ class Table:
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
             rows = len(column) if rows is None else rows
-            self._check_rows([name], [column], where, rows)
+            self._check_row_counts([name], [column], where, rows)
             out = out if found else np.empty((rows, width))
             found += column.shape[1]
             if found <= width:
@@ -86,7 +86,7 @@ class Table:
             )
         return out
 
-    def _check_rows(
+    def _check_row_counts(
         self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
     ) -> None:
         rows = len(columns[0]) if columns and rows is None else rows
@@ -98,9 +98,9 @@ class Table:
                     remedy="name columns that belong together",
                 )
 
-    def raw_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
+    def numbers_with_nan_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
         columns = [self.raw(name, where) for name in names]
-        self._check_rows(names, columns, where, None)
+        self._check_row_counts(names, columns, where, None)
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> Array:
@@ -111,7 +111,7 @@ class Table:
         column = self.columns[name]
         numbers = _column_to_numbers(column, partial(self._cell_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
-        self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
+        self.check_magnitude(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
     def single_column(self, name: str | int, where: str) -> Array:
@@ -125,7 +125,7 @@ class Table:
             )
         return numbers[:, 0]
 
-    def check_size(
+    def check_magnitude(
         self,
         values: Array,
         largest: float,
@@ -187,7 +187,7 @@ class Table:
         )
 
 
-def decimal_step(values: Array) -> float:
+def decimal_resolution(values: Array) -> float:
     """Return the largest power of ten <= 1 of which all values are multiples, or 0."""
     for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
