@@ -229,7 +229,7 @@ def _inspect_stream(
             )
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
-    return figures, findings, rows if table.kept is None else table.kept[rows]
+    return figures, findings, rows if table.kept_rows is None else table.kept_rows[rows]
 
 
 def _repeated_rows_findings(
@@ -308,7 +308,7 @@ def _inspect_clock(
 def _channel_labels(columns: Sequence[str], table: Table) -> list[str]:
     labels: list[str] = []
     for column in columns:
-        width = table.raw(column, column).shape[1]
+        width = table.numbers_with_nan(column, column).shape[1]
         labels += [column] if width == 1 else [f"{column}[{i}]" for i in range(width)]
     return labels
 
@@ -326,9 +326,9 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
 
 
 def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:
-    if len({len(table.raw(name, name)) for name in names}) != 1:
+    if len({len(table.numbers_with_nan(name, name)) for name in names}) != 1:
         return table
-    good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
+    good = np.all([np.isfinite(table.numbers_with_nan(n, n)).all(axis=1) for n in names], axis=0)
     if good.all():
         return table
     rows = len(good)

@@ -351,7 +351,7 @@ def test_mirrored_axes_are_found_despite_a_lag() -> None:
     tables = recorder.tables()
     columns = tables[Path("i")].columns
     columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
-    assert mounting(recorder, tables).mirrored
+    assert mounting(recorder, tables).is_mirrored
 
 
 def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:

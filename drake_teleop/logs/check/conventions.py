@@ -194,7 +194,7 @@ def _check_description(data: LogData, description: Description) -> Conventions:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = fit_load(data.read_thinned_log(description))
-    if broken or (mounting is not None and mounting.mirrored):
+    if broken or (mounting is not None and mounting.is_mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
     if "weight" in log.free:  # the checks below require the weight of the load in the wrench
         return Conventions(tuple(findings), fit, mounting, None)

@@ -367,7 +367,7 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
         return group
     if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):
         return group
-    size = np.linalg.norm(np.hstack([table.raw(n, n) for n in found.columns]), axis=1)
+    size = np.linalg.norm(np.hstack([table.numbers_with_nan(n, n) for n in found.columns]), axis=1)
     if kind == "specific_force":
         return group | {"unit": "g" if np.nanmedian(size) < 3 else "m/s^2"}
     usual, other, limit = {
@@ -380,7 +380,7 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
 def _are_raw_counts(table: Table, columns: list[str]) -> bool:
     if _FILL_IN_TEXT in columns:
         return False
-    first = table.raw(columns[0], columns[0])
+    first = table.numbers_with_nan(columns[0], columns[0])
     if not np.nanmedian(np.abs(first)) > _MIN_MEDIAN_RAW_COUNT:
         return False
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())

@@ -207,16 +207,16 @@ def check_imu_against_pose(
     findings: list[Finding] = []
     if (
         given.unexplained > GOOD_UNEXPLAINED_SHARE
-        or given.mirrored
+        or given.is_mirrored
         or given.rotation_angle_deg > 10
     ):
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
-            if (found := result_for_edit_or_none(fit_mounting, edited)) and not found.mirrored
+            if (found := result_for_edit_or_none(fit_mounting, edited)) and not found.is_mirrored
         ]
         limit = min(VALID_UNEXPLAINED_SHARE, given.unexplained / MIN_IMPROVEMENT)
-        if given.mirrored:
+        if given.is_mirrored:
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
         elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
@@ -227,7 +227,7 @@ def check_imu_against_pose(
         if best and best[0] < limit:
             findings.append(best[1])
             description, given = best[2], best[3]
-    if given.unexplained > VALID_UNEXPLAINED_SHARE and not given.mirrored:
+    if given.unexplained > VALID_UNEXPLAINED_SHARE and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
         finding, description = _correct_imu_clock(description, given, data)
@@ -236,7 +236,7 @@ def check_imu_against_pose(
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
         findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
         description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
-    if given.mirrored:
+    if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
             " has the wrong sign; correct imu.specific_force.columns"
@@ -278,7 +278,7 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
         description.wrench, description
     )
     scale = 1 / (1 + found.drift)
-    lag = scale * (found.lag_middle_s + found.drift * (start - found.middle_s))
+    lag = scale * (found.mid_record_lag_s + found.drift * (start - found.mid_record_time_s))
     offset, factor = time.offset - lag, scale * time.scale
     finding = Finding(
         "clock",

@@ -101,7 +101,7 @@ class LogData:
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
-                x = table.raw(column, field)
+                x = table.numbers_with_nan(column, field)
                 x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
                 thin.columns[column] = (
@@ -150,7 +150,7 @@ def channel_findings(
 def _values_by_channel(table: Table, columns: Any, where: str) -> dict[str, Array]:
     numbers: dict[str, Array] = {}
     for column in columns:
-        x = table.raw(column, where)
+        x = table.numbers_with_nan(column, where)
         for i, values in enumerate(x.T):
             numbers[str(column) if len(x.T) == 1 else f"{column}[{i}]"] = values
     return numbers

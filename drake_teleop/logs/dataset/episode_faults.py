@@ -47,10 +47,10 @@ def faults_of_hypothesis(
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
     found += _rotation_faults(
-        x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
+        x.force_axes, "the wrench" if np.allclose(x.force_axes, x.torque_axes) else "the force"
     )
-    if not np.allclose(x.force, x.torque):
-        found += _rotation_faults(x.torque, "the torque")
+    if not np.allclose(x.force_axes, x.torque_axes):
+        found += _rotation_faults(x.torque_axes, "the torque")
     found += _unit_faults(x.gain)
     late = x.lag - usual_lag
     if abs(late) >= _MIN_LAG_FRAMES:

@@ -55,7 +55,7 @@ class Hypothesis:
     Attributes:
         kind: one of `HYPOTHESIS_KINDS`.
         lag: delay of the motion behind the wrench [frames].
-        force, torque: (3, 3) rotation or mirroring of the load's force and torque.
+        force_axes, torque_axes: (3, 3) rotation or mirroring of the load's force and torque.
         gain: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
         spread: (6,) logarithms of the half widths of the residual.
@@ -65,8 +65,8 @@ class Hypothesis:
 
     kind: str
     lag: float
-    force: Array
-    torque: Array
+    force_axes: Array
+    torque_axes: Array
     gain: Array
     phi: Array | None = None
     spread: Array = field(default_factory=lambda: np.zeros(6))
@@ -76,11 +76,13 @@ class Hypothesis:
     def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
-        return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
+        return np.hstack(
+            [self.gain[0] * f @ self.force_axes.T, self.gain[1] * tau @ self.torque_axes.T]
+        )
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
-        f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
+        f, tau = wrench[:, :3] @ self.force_axes, wrench[:, 3:] @ self.torque_axes
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 
 
@@ -165,17 +167,19 @@ class HypothesisSearch:
         )
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
-        yield self.with_spread_and_cost(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
+        yield self.with_spread_and_cost(
+            replace(plain, force_axes=-np.eye(3), torque_axes=-np.eye(3))
+        )
         for M, T in ((force, force), (torque, torque), (force, torque)):
-            yield self.with_spread_and_cost(replace(plain, force=M, torque=T))
+            yield self.with_spread_and_cost(replace(plain, force_axes=M, torque_axes=T))
         for det in (1.0, -1.0):
             start = self.refit_to_best_rows(plain, det=det, scale=True)
             yield start
             yield self.refit_to_best_rows(replace(start, gain=one), det=det, scale=False)
-            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force).sum()))
+            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
             for M in (np.eye(3), -np.eye(3), nearest):
                 yield self.refit_to_best_rows(
-                    replace(start, force=M, torque=M), det=0.0, scale=True
+                    replace(start, force_axes=M, torque_axes=M), det=0.0, scale=True
                 )
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
@@ -220,7 +224,7 @@ class HypothesisSearch:
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
                 M = _fit_rotation(w, q, x.gain, det)
-                x = replace(x, force=M, torque=M)
+                x = replace(x, force_axes=M, torque_axes=M)
             if scale:
                 x = replace(x, gain=_fit_gains(w, q, x))
             x = self.with_spread_and_cost(x)
@@ -294,7 +298,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE_CHANNELS, x.force), (_TORQUE_CHANNELS, x.torque)):
+    for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
@@ -304,7 +308,7 @@ def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _rotation_cost(x.force) + float(not np.allclose(x.force, x.torque))
+    count += _rotation_cost(x.force_axes) + float(not np.allclose(x.force_axes, x.torque_axes))
     scaled = x.gain != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 

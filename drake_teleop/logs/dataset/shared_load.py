@@ -45,16 +45,16 @@ class SharedLoad:
 
     Attributes:
         phi: (10,) load that is removed.
-        lag: usual delay of the motion behind the wrench [frames].
-        typical: (6,) usual half widths of the residual [N, N m].
-        floor, threshold: noise floor and threshold of contact detection.
+        lag_frames: usual delay of the motion behind the wrench [frames].
+        usual_half_widths: (6,) usual half widths of the residual [N, N m].
+        noise_floor, threshold: noise floor and threshold of contact detection.
     """
 
     identification: Identification
     phi: Array
-    lag: float
-    typical: Array
-    floor: NoiseFloor
+    lag_frames: float
+    usual_half_widths: Array
+    noise_floor: NoiseFloor
     threshold: float
 
 

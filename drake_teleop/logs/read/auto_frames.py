@@ -60,7 +60,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
     if mounting is None:
         problem = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
-    elif mounting.mirrored:
+    elif mounting.is_mirrored:
         problem = "the axes of the IMU are mirrored relative to those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits_pose:
@@ -80,7 +80,10 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
 
 
 def _unexplained_shares_text(found: Mounting) -> str:
-    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
+    shares = {
+        "specific force": found.unexplained,
+        "angular velocity": found.unexplained_angular_velocity,
+    }
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
 

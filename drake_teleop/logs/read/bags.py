@@ -113,7 +113,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
     columns["stamp"] = columns.get("header.stamp", received)
-    return Table(path / topic.lstrip("/"), columns, absent=absent)
+    return Table(path / topic.lstrip("/"), columns, absent_groups=absent)
 
 
 def read_stream_table(stream: Wrench | Imu | Pose | Static) -> Table:

@@ -181,7 +181,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     def are_columns_present(names: Sequence[str]) -> bool:
         found = [name for name in names if name in table.columns]
         if found and len(found) < len(names):
-            table.numbers(names, len(names), str(path))
+            table.finite_numbers(names, len(names), str(path))
         return bool(found)
 
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
@@ -190,7 +190,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
         )
-    table.numbers(WRENCH_COLUMNS, 6, str(path))
+    table.finite_numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
         name: {"columns": names}
         for name, names in _KINEMATIC_COLUMNS.items()
@@ -213,7 +213,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
         )
-    table.raw("t", str(path))
+    table.numbers_with_nan("t", str(path))
     stream = {"file": path, "time": {"column": "t"}}
     streams: dict[str, Any] = {"wrench": wrench | stream}
     pose = {name: fields.pop(name) for name in ("orientation", "position") if name in fields}
@@ -229,7 +229,7 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
     if not q and "specific_force" not in fields:
         return False
     if "angular_velocity" in fields:
-        speed = table.numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
+        speed = table.finite_numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
         if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED_RAD_S:
             return False
     if "t" not in table.columns:
@@ -242,10 +242,10 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if q:
         vertical = rotation_matrices(
-            table.numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
+            table.finite_numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
         )[:, 2]
     else:
-        vertical = table.numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
+        vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
     return bool(np.quantile(turned, 0.8) > _MIN_TURN_BETWEEN_POSES_RAD)

@@ -33,21 +33,21 @@ class Clock:
     """Increasing times t (N,) of the rows of a stream on the common clock [s].
 
     Attributes:
-        rows: (N,) row of the table for each time.
-        total: number of the table's rows, with removed ones.
+        table_rows: (N,) row of the table for each time.
+        num_table_rows: number of the table's rows, with removed ones.
         notes: sentences about corrections.
-        episodes: number of times at which the clock starts.
+        num_episodes: number of times at which the clock starts.
     """
 
     t: Array
-    rows: NDArray[np.intp]
-    total: int
+    table_rows: NDArray[np.intp]
+    num_table_rows: int
     notes: tuple[str, ...] = ()
-    episodes: int = 1
+    num_episodes: int = 1
 
     def select_timed_rows(self, x: Array) -> Array:
-        """Return the rows of x (total, ...) that have a time."""
-        return x if len(self.rows) == self.total else x[self.rows]
+        """Return the rows of x (num_table_rows, ...) that have a time."""
+        return x if len(self.table_rows) == self.num_table_rows else x[self.table_rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
@@ -95,12 +95,12 @@ def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Arra
     Episodes are joined in the whole table, so that all its streams keep one clock.
     """
     assert time.column is not None
-    whole = table.whole or table
+    whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
-        stamps = whole.raw(name, f"{where}.column")
+        stamps = whole.numbers_with_nan(name, f"{where}.column")
         if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
-            whole.numbers([name], 1, f"{where}.column")
+            whole.finite_numbers([name], 1, f"{where}.column")
     if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
         raise DrakeTeleopError(
             "the column holds dates or times of day, which have no unit",
@@ -112,21 +112,21 @@ def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Arra
     if time.nanoseconds is not None:
         t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
     t, episodes = join_episodes(t)
-    return (t if table.kept is None else t[table.kept]), episodes
+    return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 
 
 def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
         raise DrakeTeleopError(
-            f"the clock starts {clock.episodes} times, which requires all streams in one file",
+            f"the clock starts {clock.num_episodes} times, which requires all streams in one file",
             where=where,
             remedy="write all streams into one table, or each episode into files of its own",
         )
     if not where.endswith("wrench.time"):
         return []
     return [
-        f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or more"
+        f"the clock starts {clock.num_episodes} times: the episodes follow each other, 1 s or more"
         " apart; samples near their ends are not used"
     ]
 
@@ -209,7 +209,7 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
 def _remove_repeated_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
-    values = [table.raw(column, where) for column in columns]
+    values = [table.numbers_with_nan(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
     for x in values:

@@ -277,11 +277,12 @@ class Mounting:
     Attributes:
         R_SI: (3, 3) rotation from the described IMU axes to S.
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
-        lag_middle_s, middle_s: lag at mid-record, and this time on the pose's clock [s].
+        mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
+            [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained, unexplained_turning: unexplained shares of the variance of specific force and
-            angular velocity (None without a gyroscope).
-        mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
+        unexplained, unexplained_angular_velocity: unexplained shares of the variance of specific
+            force and angular velocity (None without a gyroscope).
+        is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
         lever: position of the accelerometer; None without positions.
@@ -289,12 +290,12 @@ class Mounting:
 
     R_SI: Array
     lag_s: float
-    lag_middle_s: float
-    middle_s: float
+    mid_record_lag_s: float
+    mid_record_time_s: float
     drift: float
     unexplained: float
-    unexplained_turning: float | None
-    mirrored: bool
+    unexplained_angular_velocity: float | None
+    is_mirrored: bool
     speed_ratio: float | None
     deviations_deg: Array
     lever: LeverArm | None
@@ -321,16 +322,19 @@ class Mounting:
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
-            self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED_SHARE
+            self.unexplained_angular_velocity is None
+            or self.unexplained_angular_velocity < MAX_UNEXPLAINED_SHARE
         )
         if self.lever is not None:
-            return not self.mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
+            return (
+                not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
+            )
         # Without positions the pose determines the angular velocity, but not the acceleration.
         known = (
-            self.unexplained_turning is not None
+            self.unexplained_angular_velocity is not None
             or self.unexplained < MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS
         )
-        return not self.mirrored and omega_agrees and known
+        return not self.is_mirrored and omega_agrees and known
 
     @property
     def is_determined(self) -> bool:
@@ -391,12 +395,12 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     return Mounting(
         R_SI=_rotated_by_vector(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
-        lag_middle_s=float(x[3]),
-        middle_s=centre,
+        mid_record_lag_s=float(x[3]),
+        mid_record_time_s=centre,
         drift=drift,
         unexplained=shares[0],
-        unexplained_turning=shares[1] if len(shares) > 1 else None,
-        mirrored=mirrored,
+        unexplained_angular_velocity=shares[1] if len(shares) > 1 else None,
+        is_mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
         lever=lever,

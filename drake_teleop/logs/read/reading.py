@@ -147,7 +147,7 @@ class _LogReader:
             self._replace_auto_fields(estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
-        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.total)
+        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_table_rows)
         wrench = clock.select_timed_rows(wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -160,9 +160,11 @@ class _LogReader:
         log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
         log = replace(log, gain_std=gain_std, free=free, described=self._description)
-        if pose is not None and pose.raw is not None:
-            inertial = None if imu is None else imu.inertial
-            log = replace(log, posed=self._description.poses_with_frame(pose.raw, inertial))
+        if pose is not None and pose.recorded_poses is not None:
+            inertial = None if imu is None else imu.imu_data
+            log = replace(
+                log, posed=self._description.poses_with_frame(pose.recorded_poses, inertial)
+            )
         log = log if keep_origin else log.with_times_from(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
@@ -206,7 +208,7 @@ class _LogReader:
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> Array:
         where = f"{self._source}:{name}.{field}.columns"
-        values = table.numbers(quantity.columns, 3, where, rows)
+        values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= (
             sign * self._description.si_value_of_unit(quantity.unit) * np.array(quantity.scale)
@@ -229,7 +231,7 @@ class _LogReader:
             raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
             wrench, imu = self._description.wrench, self._description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
-                return Stream("pose", t, raw=raw)
+                return Stream("pose", t, recorded_poses=raw)
         dt = mean_time_step(t)
         self._include_window_in_one_sided_ends(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
@@ -251,15 +253,19 @@ class _LogReader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._read_vectors("pose", "position", stream.position, table, clock.total)
+            position = self._read_vectors(
+                "pose", "position", stream.position, table, clock.num_table_rows
+            )
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
-        orientations = OrientationColumns(self._description, form, table, clock.total, where)
-        quaternion = orientations.allocate_quaternions(len(clock.rows))
+        orientations = OrientationColumns(
+            self._description, form, table, clock.num_table_rows, where
+        )
+        quaternion = orientations.allocate_quaternions(len(clock.table_rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CONVERTED_CHUNK_ROWS):
             part = slice(start, start + _CONVERTED_CHUNK_ROWS)
-            q = orientations.quaternions(clock.rows[part])
+            q = orientations.quaternions(clock.table_rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
@@ -280,7 +286,7 @@ class _LogReader:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
-            values = self._read_vectors("imu", field, quantity, table, clock.total, sign)
+            values = self._read_vectors("imu", field, quantity, table, clock.num_table_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
             return self._rotate_to_S("imu", stream.frame, values, t, pose)
 
@@ -295,7 +301,7 @@ class _LogReader:
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_GAP_OVER_STEP * dt  # outside of gaps
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, inertial=ImuData(t[outside_gaps], *both))
+        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
     def _rotate_to_S(
         self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
@@ -359,7 +365,9 @@ class _LogReader:
 
     def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
         force, torque = (
-            decimal_resolution(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
+            decimal_resolution(
+                table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
+            )
             * (self._description.si_value_of_unit(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
@@ -380,7 +388,7 @@ class _LogReader:
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
         found_gaps = find_gaps_in_times(t, self._bandwidth_hz)
-        if clock.episodes > 1:
+        if clock.num_episodes > 1:
             described = (self._description.wrench, self._description.imu, self._description.pose)
             files = len({stream.source for stream in described if stream is not None})
             self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")

@@ -40,7 +40,7 @@ MAX_PLAUSIBLE_VALUES = {
 class Stream:
     """Signals (N, ...) of one stream on its clock `t` [s]; None for absent signals.
 
-    `raw` are the recorded poses of S, `inertial` the IMU data in S.
+    `recorded_poses` are the poses of S, `imu_data` the IMU data in S.
     """
 
     name: str
@@ -49,8 +49,8 @@ class Stream:
     angular_velocity: Array | None = None
     angular_acceleration: Array | None = None
     R_WS: Array | None = None
-    raw: Poses | None = None
-    inertial: ImuData | None = None
+    recorded_poses: Poses | None = None
+    imu_data: ImuData | None = None
 
     @property
     def dt(self) -> float:
@@ -104,7 +104,7 @@ class OrientationColumns:
     ) -> None:
         self._orientation, self._table, self._where = orientation, table, where
         width = NUM_COLUMNS_OF_FORM[orientation.form]
-        self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
+        self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
             self._columns *= description.si_value_of_unit(orientation.unit)
 
