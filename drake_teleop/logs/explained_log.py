@@ -241,7 +241,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain_misfit(data, instants_at_delay, log.free)
+    why = explain_misfit(data, instants_at_delay, log.estimated_quantities)
     if log.described is None:
         return why
     causes = add_description_lines(why.causes, log, by_pose=found is not None)

@@ -83,7 +83,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     wrench = smooth.wrench[rows]
     scale = _channel_scales(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
-    if "weight" in log.free and smooth.gravity is not None:
+    if "weight" in log.estimated_quantities and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
         V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
     V, w = V / scale[:, None], wrench / scale

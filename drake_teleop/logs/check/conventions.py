@@ -179,7 +179,9 @@ def _check_description(data: LogData, description: Description) -> Conventions:
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
         return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
-    if "gravity" in log.free and log.described is not None:  # determine it once, not for each edit
+    if (
+        "gravity" in log.estimated_quantities and log.described is not None
+    ):  # determine it once, not for each edit
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
@@ -196,7 +198,9 @@ def _check_description(data: LogData, description: Description) -> Conventions:
     fit = fit_load(data.read_thinned_log(description))
     if broken or (mounting is not None and mounting.is_mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
-    if "weight" in log.free:  # the checks below require the weight of the load in the wrench
+    if (
+        "weight" in log.estimated_quantities
+    ):  # the checks below require the weight of the load in the wrench
         return Conventions(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = drift_finding(description, data)

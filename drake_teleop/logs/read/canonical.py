@@ -67,7 +67,7 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        free: those of "gravity" and "weight" that are estimated from the data.
+        estimated_quantities: those of "gravity" and "weight" that are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
 
     Raises:
@@ -90,7 +90,7 @@ class Log:
     gravity_W: Array | None = None
     one_sided_s: float = 0.0
     described: Description | None = None
-    free: tuple[str, ...] = ()
+    estimated_quantities: tuple[str, ...] = ()
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -132,9 +132,9 @@ class Log:
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
-    def with_times_from(self, start: float) -> Log:
+    def with_times_relative_to(self, start: float) -> Log:
         """Return the log with times relative to `start` [s]."""
-        posed = None if self.posed is None else self.posed.with_times_from(start)
+        posed = None if self.posed is None else self.posed.with_times_relative_to(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def select_rows(self, rows: slice | NDArray[np.bool_]) -> Log:

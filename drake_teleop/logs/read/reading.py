@@ -159,13 +159,15 @@ class _LogReader:
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
-        log = replace(log, gain_std=gain_std, free=free, described=self._description)
+        log = replace(
+            log, gain_std=gain_std, estimated_quantities=free, described=self._description
+        )
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
             log = replace(
                 log, posed=self._description.poses_with_frame(pose.recorded_poses, inertial)
             )
-        log = log if keep_origin else log.with_times_from(float(clock.t[0]))
+        log = log if keep_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
