@@ -45,7 +45,7 @@ from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
 from drake_teleop.logs.processing import identify_log, usable_phi
-from drake_teleop.logs.read.alignment import given_or_estimated_delay, low_pass, remove_delay
+from drake_teleop.logs.read.alignment import choose_delay, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.calibration import evaluate_record
@@ -343,7 +343,7 @@ def ntnu(records: Path, folder: Path) -> dict[str, Any]:
     by_peer = {"ours": usable_phi(fit)[0], "kth": np.concatenate([theta[:4], np.zeros(6)])}
     for record in ("1-baseline", "2-vibrations"):
         log = read_log(described(records, record, folder))
-        late = remove_delay(log, given_or_estimated_delay(log, 30.0, "auto", by_peer["ours"])[0])
+        late = remove_delay(log, choose_delay(log, 30.0, "auto", by_peer["ours"])[0])
         for name, phi in by_peer.items():
             # Others do not know of a delay, nor of more than gravity.
             of = late if name == "ours" else log

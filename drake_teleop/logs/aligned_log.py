@@ -21,12 +21,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     motion_of_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import (
-    given_or_estimated_delay,
-    is_near_ends,
-    low_pass,
-    remove_delay,
-)
+from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -71,9 +66,7 @@ def _fit_with_delay_or_usual(
     usual_s: float,
     usual: str,
 ) -> tuple[_Motion, str]:
-    known, source = (
-        (None, "estimated") if delay == "auto" else given_or_estimated_delay(log, None, delay)
-    )
+    known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
     if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
@@ -162,7 +155,7 @@ def read_aligned_log(
     `delay` [s] or "auto" is removed; `usual_s` [s] is used if the record does not determine it.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
-    weight_removed = weight_removed or "weight" in log.estimated_quantities
+    weight_removed = weight_removed or "weight" in log.estimated
     smooth = None
     coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
     with one_blas_thread():
@@ -182,7 +175,7 @@ def read_aligned_log(
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
     log = replace_force_by_acceleration(log) if weight_removed else log
-    delay_s, source = given_or_estimated_delay(log, cutoff_hz, delay, phi)
+    delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
     log = remove_delay(log, delay_s)

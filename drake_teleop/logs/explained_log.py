@@ -241,7 +241,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain_misfit(data, instants_at_delay, log.estimated_quantities)
+    why = explain_misfit(data, instants_at_delay, log.estimated)
     if log.described is None:
         return why
     causes = add_description_lines(why.causes, log, by_pose=found is not None)
@@ -295,7 +295,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identification:
-    if not why.causes and not why.always_estimated:
+    if not why.causes and not why.always_fitted:
         if why.explained or not load.identifiable.any():
             return load
         stated = np.sqrt(np.diag(load.covariance))
@@ -320,7 +320,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         identifiable=identifiable,
         residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
-        or "weight" in why.always_estimated,
+        or "weight" in why.always_fitted,
         prior_dominated=np.zeros(16, bool),
         degrees_of_freedom=np.full(16, np.inf),
         method="generalised least squares with named causes",
@@ -346,7 +346,7 @@ def unexplained_finding(why: Explanation) -> Finding:
 
 
 def removed_weight_note(why: Explanation) -> str:
-    if "weight" not in why.always_estimated or why.removed_weight is None:
+    if "weight" not in why.always_fitted or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
     deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))

@@ -19,12 +19,7 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations
-from drake_teleop.logs.read.bags import (
-    draft_bag_description,
-    is_bag,
-    list_topics,
-    read_stream_table,
-)
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream_table
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_episodes
 from drake_teleop.logs.read.description import Description, load_description
@@ -88,7 +83,7 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
             for topic in topics
         }
-        return Draft(*draft_bag_description(path, topics, out))
+        return Draft(*draft_of_bag(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
         raise DrakeTeleopError(
             "a log description names all files of a recording, so that no others can be added",

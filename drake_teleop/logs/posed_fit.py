@@ -62,7 +62,7 @@ def fit_posed(
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
     found, source = estimate_motion_and_load(log, delay)
-    finding = None if log.estimated_quantities else pose_unit_or_frame_finding(found, log)
+    finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.turned and not found.frame.shifted
         if not found.imu_agrees or (finding is not None and not rotated):

@@ -56,8 +56,8 @@ from drake_teleop.logs.explained_log import (
 )
 from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
+    choose_delay,
     far_from_gaps,
-    given_or_estimated_delay,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -199,7 +199,7 @@ def _identify_read_log(
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:
-        delay_s, source = given_or_estimated_delay(log, cutoff_hz, delay)
+        delay_s, source = choose_delay(log, cutoff_hz, delay)
         log = remove_delay(log, delay_s)
         log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
@@ -236,7 +236,7 @@ def _identify_read_log(
         result = explained_load(result, why)
         causes = replace_frame_causes(why, other[0]) if other else why.causes
     note = fit.note if not causes or (why is not None and why.has_several_gains) else ""
-    if raw.estimated_quantities and why is not None:
+    if raw.estimated and why is not None:
         note = removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
@@ -244,7 +244,7 @@ def _identify_read_log(
     findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
     if errors:
         findings = errors
-    elif not causes and not raw.estimated_quantities:
+    elif not causes and not raw.estimated:
         findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
@@ -463,7 +463,7 @@ def _eliminate_read_log(
     offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
-    removed = identification.weight_removed or "weight" in log.estimated_quantities
+    removed = identification.weight_removed or "weight" in log.estimated
     _check_gravity(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import replace_force_by_acceleration
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import far_from_gaps, given_or_estimated_delay, remove_delay
+from drake_teleop.logs.read.alignment import choose_delay, far_from_gaps, remove_delay
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
@@ -44,7 +44,7 @@ class ReplayLogSource(Source[Reading]):
         delay_s = 0.0
         if load is not None:
             log = replace_force_by_acceleration(log) if load.weight_removed else log
-            delay_s, source = given_or_estimated_delay(log, cutoff_hz, delay, usable_phi(load)[0])
+            delay_s, source = choose_delay(log, cutoff_hz, delay, usable_phi(load)[0])
             if source == "undetermined":
                 delay_s = load.delay_s
             log = remove_delay(log, delay_s)

@@ -17,7 +17,7 @@ from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
 from drake_teleop.logs.causes.explain import _apply_fitted_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
-from drake_teleop.logs.causes.state import State, quadratic_likelihood_gain
+from drake_teleop.logs.causes.state import State, first_order_gain
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -67,7 +67,7 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
     for key, value in figures.items():
         found = cause.values[key]
         assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
-    given = causes_of_fit(state_of(model, values), always_estimated=model.extensions)
+    given = causes_of_fit(state_of(model, values), always_fitted=model.extensions)
     assert bool(given) != bool(model.extensions)
 
 
@@ -133,10 +133,10 @@ def test_gain_of_smooth_signals_counts_independent_ones(scale):
     rng = np.random.default_rng(0)
     A, e = rng.normal(size=(30, 4)) * [1.0, scale, 1e-3, 2.0], rng.normal(size=30)
     for columns, rank in ((A, 4), (np.column_stack([A, A[:, 0] + A[:, 3], 0.0 * e]), 4)):
-        gain, found = quadratic_likelihood_gain(columns.T @ columns, columns.T @ e)
+        gain, found = first_order_gain(columns.T @ columns, columns.T @ e)
         fitted = A @ np.linalg.lstsq(A, e, rcond=None)[0]
         assert found == rank and gain == pytest.approx(fitted @ fitted, rel=1e-5)
-    some = quadratic_likelihood_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
+    some = first_order_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
     assert some[1] == 3 and some[0] < gain
 
 

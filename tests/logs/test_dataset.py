@@ -20,7 +20,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
 from drake_teleop.logs.dataset.dataset_files import open_dataset
-from drake_teleop.logs.dataset.episode_faults import faults_of_hypothesis, saturation_faults
+from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     find_hypothesis,
@@ -51,10 +51,7 @@ def verdict(x: SampleEpisode) -> set[str]:
     signals = EpisodeSignals(log_of(x))
     predict = signals.reading_predictor(TRUE_PHI)
     found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * WRENCH_NOISE_STD)
-    names = {
-        f.name
-        for f in faults_of_hypothesis(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)
-    }
+    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(
         unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
     )

@@ -26,39 +26,24 @@ EXTENSIONS_BY_PLAUSIBILITY = (
     *("frame", "rotation", "contact", "cable", "drift"),
 )
 """Order of plausibility: of nearly equal candidates the first is chosen."""
-_TORQUE_UNIT_RATIOS = (
-    10.0,
-    100.0,
-    1000.0,
-    8.850746,
-    4.448222,
-    9.80665,
-    98.0665,
-    1.355818,
-    12.0,
-    39.37008,
-)
+_UNIT_RATIOS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
 TORQUE_UNIT_FACTORS = tuple(
     sign * ratio
     for sign in (1.0, -1.0)
-    for ratio in (1.0, *_TORQUE_UNIT_RATIOS, *(1.0 / x for x in _TORQUE_UNIT_RATIOS))
+    for ratio in (1.0, *_UNIT_RATIOS, *(1.0 / x for x in _UNIT_RATIOS))
     if sign * ratio != 1.0
 )
 """Ratios of known units and signs between torque and force."""
 _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
 _MIN_TILT_DEG, _MAX_GRAVITY_ERROR_IF_TILTED, _MAX_GRAVITY_ERROR_IF_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
-_MIN_GAIN_ERROR, _MAX_GAIN_ERROR, _MIN_FRAME_SHIFT_M, _MIN_SENSOR_ROTATION_DEG = (
-    0.003,
-    0.25,
-    0.010,
-    1.0,
-)
-_MIN_MASS_OVER_DEVIATION, _MAX_FRAME_SHIFT_M, _MAX_CABLE_STIFFNESS_N_M = (
-    10.0,
-    1.5,
-    1000.0,
-)  # 1, m, N/m
+_MIN_GAIN_ERROR = 0.003
+_MAX_GAIN_ERROR = 0.25
+_MIN_FRAME_SHIFT_M = 0.010
+_MIN_SENSOR_ROTATION_DEG = 1.0
+_MIN_MASS_OVER_DEVIATION = 10.0
+_MAX_FRAME_SHIFT_M = 1.5
+_MAX_CABLE_STIFFNESS_N_M = 1000.0
 _MIN_DRIFT_OVER_NOISE = 3.0
 _NEGATIVE_INERTIA_DEVIATIONS, _NEGATIVE_INERTIA_SHARE = 8.0, 0.1
 _FACTOR_ERROR_MARGIN, _MAX_FACTOR_ERROR, _MAX_ERROR_OF_EXTREME_FACTOR = 0.02, 0.06, 0.2
@@ -171,7 +156,7 @@ def has_negative_inertia(state: State) -> bool:
     return bool(least[0] < -max(_NEGATIVE_INERTIA_DEVIATIONS * deviation, smallest))
 
 
-def is_physically_plausible(state: State) -> bool:
+def is_plausible(state: State) -> bool:
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.extensions, float(np.sqrt(state.fit.covariance[6, 6]))

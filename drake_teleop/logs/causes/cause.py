@@ -56,7 +56,7 @@ class RecordPartWithLoad:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of_fit(state: State, always_estimated: tuple[str, ...] = ()) -> list[Cause]:
+def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cause]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_wrong_axes_cause(model.axes))
@@ -72,7 +72,7 @@ def causes_of_fit(state: State, always_estimated: tuple[str, ...] = ()) -> list[
     out += [
         makers[name](state)
         for name in model.extensions
-        if name in makers and name not in always_estimated
+        if name in makers and name not in always_fitted
     ]
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))

@@ -15,23 +15,21 @@ from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
     State,
     TimeSpans,
+    first_order_gain,
     is_in_spans,
-    quadratic_likelihood_gain,
     regularized_inverse,
 )
 
 _MIN_LIKELIHOOD_GAIN = 60.0
 _REFINEMENT_MOVES_INSTANTS, _MAX_REFINEMENT_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-MIN_OMITTED_RAMP_S = 0.5
+OMITTED_RAMP_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
 _NUM_TRIED_STEP_TIMES = 2
-(
-    _SIGNIFICANT_DEVIATIONS,
-    _MIN_OFFSET_STEP_OVER_NOISE,
-    _MIN_MASS_STEP_SHARE,
-    _MIN_MOMENT_STEP_ARM_M,
-) = 5.0, 2.0, 0.01, 0.002
+_SIGNIFICANT_DEVIATIONS = 5.0
+_MIN_STEP_OVER_NOISE = 2.0
+_MIN_MASS_STEP_SHARE = 0.01
+_MIN_MOMENT_STEP_ARM_M = 0.002
 
 
 def add_step(state: State, kind: str) -> State | None:
@@ -104,7 +102,7 @@ class _StepScan:
         mixed = gram[:, which]
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
-        return quadratic_likelihood_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+        return first_order_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
 def fit_with_ramps(
@@ -115,9 +113,7 @@ def fit_with_ramps(
     widths: Sequence[float] | None = None,
 ) -> State:
     """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
-    widths = [
-        max(MIN_OMITTED_RAMP_S, w + MIN_OMITTED_RAMP_S) for w in (widths or [0.0] * len(times))
-    ]
+    widths = [max(OMITTED_RAMP_S, w + OMITTED_RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
@@ -199,7 +195,7 @@ def _is_step_significant(state: State, i: int) -> bool:
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _SIGNIFICANT_DEVIATIONS * deviations
         return bool(
-            (clear & (np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise)).any()
+            (clear & (np.abs(values) > _MIN_STEP_OVER_NOISE * state.data.wrench_noise)).any()
         )
     mass = max(abs(state.x[6]), 1e-3)
     heavier = abs(values[0]) > max(
@@ -210,18 +206,12 @@ def _is_step_significant(state: State, i: int) -> bool:
     return bool(heavier or moved)
 
 
-_TRIED_KEPT_SHARES, _MAX_TRIMMED_FIT_ITERATIONS, _MIN_FITTED_BLOCKS, _BLOCK_SET_GROWTH = (
-    (0.12, 0.3, 0.55),
-    15,
-    8,
-    1.3,
-)
+_TRIED_KEPT_SHARES = (0.12, 0.3, 0.55)
+_MAX_TRIMMED_FIT_ITERATIONS = 15
+_MIN_FITTED_BLOCKS = 8
+_BLOCK_SET_GROWTH = 1.3
 _START_SET_LENGTHS_BLOCKS, _BOTH_ENDS_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
-(
-    _MIN_CONTACT_RESIDUAL_OVER_NOISE,
-    _MIN_CONTACT_OVER_CALM_RESIDUAL,
-    _MIN_EXCESS_OVER_CALM_RESIDUAL,
-) = 8.0, 5.0, 1.3
+_CONTACT_OVER_NOISE, _CONTACT_OVER_CALM, _EXCESS_OVER_CALM = 8.0, 5.0, 1.3
 _MAX_LOADS, _MAX_STEPS, _MIN_RUN_BLOCKS, _MAX_UNCOVERED_SHARE = 4, 4, 4, 0.12
 _MAX_RESIDUAL_INCREASE, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
@@ -278,7 +268,7 @@ class _ResidualBlocks:
         data = state.data
         self._state = state
         y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
-        sums = data.block_sums_of_lagged_products(y, rows=data.rows_per_block, lags=1)[:, 0]
+        sums = data.lagged_block_sums(y, rows=data.rows_per_block, lags=1)[:, 0]
         self._counts = sums[:, 0, 0]
         self.usable = self._counts > 0.5 * data.rows_per_block
         J = state.model.wrench_derivative(state.x)
@@ -301,16 +291,12 @@ class _ResidualBlocks:
         if found is None:
             return None
         level, calm, move = found
-        excess = np.sqrt(np.maximum(level**2 - (_MIN_EXCESS_OVER_CALM_RESIDUAL * calm) ** 2, 0.0))
-        quantile = min(
-            0.25, 0.5 * float(np.mean(level[among] < _MIN_CONTACT_OVER_CALM_RESIDUAL * calm))
-        )
+        excess = np.sqrt(np.maximum(level**2 - (_EXCESS_OVER_CALM * calm) ** 2, 0.0))
+        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_OVER_CALM * calm)))
         by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
         usual = np.hypot(calm, by_motion)
         return np.asarray(
-            (level > _MIN_CONTACT_RESIDUAL_OVER_NOISE)
-            & (level > _MIN_CONTACT_OVER_CALM_RESIDUAL * usual)
-            & among
+            (level > _CONTACT_OVER_NOISE) & (level > _CONTACT_OVER_CALM * usual) & among
         )
 
     def _fit_calmest_blocks(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
@@ -334,9 +320,7 @@ class _ResidualBlocks:
             if self._do_other_blocks_differ(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
-        limit = max(
-            _MIN_CONTACT_RESIDUAL_OVER_NOISE**2, (_MIN_CONTACT_OVER_CALM_RESIDUAL**2) * usual
-        )
+        limit = max(_CONTACT_OVER_NOISE**2, (_CONTACT_OVER_CALM**2) * usual)
         level, move = min(found, key=lambda x: float(np.minimum(x[0][blocks], limit).sum()))
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
@@ -348,8 +332,7 @@ class _ResidualBlocks:
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
         return bool(
-            np.mean(level[others] > _MIN_CONTACT_OVER_CALM_RESIDUAL**2 * predicted)
-            > 1.0 - _MAX_UNCOVERED_SHARE
+            np.mean(level[others] > _CONTACT_OVER_CALM**2 * predicted) > 1.0 - _MAX_UNCOVERED_SHARE
         )
 
     def _trimmed_fit(
@@ -403,11 +386,10 @@ def replace_steps_by_contact(state: State) -> State:
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
             return State.fit_record(state.data, model, x, (*state.spans, span))
-        if _median_residual_over_noise(state, span) > _MIN_CONTACT_RESIDUAL_OVER_NOISE:
+        if _median_residual_over_noise(state, span) > _CONTACT_OVER_NOISE:
             calm = State.fit_record(state.data, model, x, (*state.spans, span))
             if calm.residual_ratio < min(
-                _MIN_CONTACT_OVER_CALM_RESIDUAL,
-                state.residual_ratio / _MIN_CONTACT_OVER_CALM_RESIDUAL,
+                _CONTACT_OVER_CALM, state.residual_ratio / _CONTACT_OVER_CALM
             ):
                 return shrink_contacts(calm)
     return state
@@ -429,9 +411,7 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
     usual = np.maximum(
         np.maximum(data.wrench_noise, state.rows.residual_rms(state.fit.residual)), 1e-12
     )
-    large = (
-        np.abs(y[inside] @ state.fit.residual.T) > _MIN_CONTACT_OVER_CALM_RESIDUAL * usual
-    ).any(axis=1)
+    large = (np.abs(y[inside] @ state.fit.residual.T) > _CONTACT_OVER_CALM * usual).any(axis=1)
     first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
     if not len(first):
         return span

@@ -14,7 +14,7 @@ from drake_teleop.logs.causes.candidates import (
     fit_candidates,
     has_negative_inertia,
     has_negative_mass,
-    is_physically_plausible,
+    is_plausible,
     start_parameters_of_tilt_fit,
 )
 from drake_teleop.logs.causes.cause import (
@@ -31,7 +31,7 @@ from drake_teleop.logs.causes.changes import (
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     gain_covariance,
-    jackknife_deviations_over_parts,
+    jackknife_over_parts,
     load_covariance,
     misfit_deviations,
     torque_unit_covariance,
@@ -41,40 +41,27 @@ from drake_teleop.logs.causes.state import State
 
 MAX_SEARCH_ROUNDS = 4
 InstantsAtDelay = Callable[[float], Instants]
-_MIN_CORRECTED_DELAY_S, _MAX_CORRECTED_DELAY_S, _EQUAL_DELAY_TOLERANCE_S, _DELAY_ITERATIONS = (
-    5e-4,
-    0.3,
-    0.004,
-    4,
-)  # s
+_MIN_CORRECTED_DELAY_S = 5e-4
+_MAX_CORRECTED_DELAY_S = 0.3
+_EQUAL_DELAY_TOLERANCE_S = 0.004
+_DELAY_ITERATIONS = 4
 MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
 _MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
-(
-    _MAX_RESIDUAL_SHARE_OF_CONTACT,
-    _MUCH_SMALLER_RESIDUAL_SHARE,
-    _MAX_COLOURED_RESIDUAL_OVER_NOISE,
-    _REDUCED_MISFIT_SHARE,
-    _CERTAIN_SCORE,
-) = (
-    0.5,
-    0.2,
-    15.0,
-    0.9,
-    1000.0,
-)
-_MIN_WEIGHT_SCORE_SHARE_OF_CABLE = 1.0 / 3.0
+_HALVED_RESIDUAL = 0.5
+_MUCH_SMALLER_RESIDUAL = 0.2
+_COLOURED_NOISE_RATIO = 15.0
+_REDUCED_MISFIT_SHARE = 0.9
+_CERTAIN_SCORE = 1000.0
+_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
 _GOOD_SMOOTH_MISFIT = 1.35
 """Largest smooth misfit of good records."""
 _STEP_CAUSES, _MAX_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
-_FLEXIBLE_CAUSES, _FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE = (
-    ("cable", "drift"),
-    80.0,
-    0.1,
-)
-"""Causes with many columns, which resemble others; required margins of their scores."""
+_FLEXIBLE_CAUSES = ("cable", "drift")
+"""Causes with many columns, which resemble others and require margins of their scores."""
+_FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE = 80.0, 0.1
 
 
 def residual_is_noise(state: State) -> bool:
@@ -101,15 +88,13 @@ SearchResult = tuple[State, float, list[Candidate]]
 
 
 def search_causes(
-    data: Instants,
-    with_delay: InstantsAtDelay | None = None,
-    always_estimated: tuple[str, ...] = (),
+    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
     Arguments are as for `explain_misfit`.
     """
-    plain = Model(extensions=always_estimated)
+    plain = Model(extensions=always_fitted)
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
@@ -120,7 +105,7 @@ def search_causes(
         is_wrench = opposite[0].model.torque_factor > 0.0
         if (
             is_wrench
-            and opposite[0].residual_ratio < _MUCH_SMALLER_RESIDUAL_SHARE * found[0].residual_ratio
+            and opposite[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
         ):
             found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
@@ -133,7 +118,7 @@ def search_causes(
         residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
     )
     better = better or (
-        repeated[0].residual_ratio < _MUCH_SMALLER_RESIDUAL_SHARE * found[0].residual_ratio
+        repeated[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
     )
     return repeated if better else found
 
@@ -141,17 +126,13 @@ def search_causes(
 def may_be_coloured_noise(state: State) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
     return (
-        state.smooth_misfit < _GOOD_SMOOTH_MISFIT
-        and state.residual_ratio < _MAX_COLOURED_RESIDUAL_OVER_NOISE
+        state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
 
 
 def is_clear_misfit(state: State) -> bool:
     """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
-    return (
-        state.smooth_misfit > MAX_SMOOTH_MISFIT
-        or state.residual_ratio > _MAX_COLOURED_RESIDUAL_OVER_NOISE
-    )
+    return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
 
 
 def _initial_state(data: Instants, model: Model) -> State:
@@ -169,7 +150,7 @@ def _search_causes_from(
         if residual_is_noise(state):
             return state, delay_s, []
         found = _remove_cable_if_attenuated(list(fit_candidates(state, first=number == 0)))
-        rejected = [x for x in found if is_physically_plausible(x.state)]
+        rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_effective(x, state)]
         winner, calmest = (
             _best_candidate(effective),
@@ -197,12 +178,9 @@ def _search_causes_from(
 
 def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
     best = max(
-        (x.score for x in found if x.name == "weight" and not is_physically_plausible(x.state)),
-        default=0,
+        (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
-    return [
-        x for x in found if x.name != "cable" or best < _MIN_WEIGHT_SCORE_SHARE_OF_CABLE * x.score
-    ]
+    return [x for x in found if x.name != "cable" or best < _WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
 def _apply_fitted_delay(
@@ -225,9 +203,7 @@ def _apply_fitted_delay(
 def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
     small = [x for x in found if x.name in _SMOOTH_CAUSES]
     small = [
-        x
-        for x in small
-        if x.state.residual_ratio < _MUCH_SMALLER_RESIDUAL_SHARE * state.residual_ratio
+        x for x in small if x.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * state.residual_ratio
     ]
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
@@ -237,15 +213,14 @@ def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> C
 def _has_much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
     if calmest is None or calmest.name == "contact":
         return False
-    return calmest.state.residual_ratio < _MUCH_SMALLER_RESIDUAL_SHARE * winner.state.residual_ratio
+    return calmest.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * winner.state.residual_ratio
 
 
 def _explain_contact_by_steps(state: State, found: list[Candidate]) -> State | None:
     for candidate in found:
         if (
             candidate.name == "contact"
-            and candidate.state.residual_ratio
-            < _MAX_RESIDUAL_SHARE_OF_CONTACT * state.residual_ratio
+            and candidate.state.residual_ratio < _HALVED_RESIDUAL * state.residual_ratio
         ):
             return replace_contacts_by_steps(candidate.state)
     return None
@@ -285,7 +260,7 @@ def _best_candidate(found: list[Candidate]) -> Candidate | None:
     )
 
 
-_MAX_ABSENT_MASS_KG, _ABSENT_MASS_DEVIATIONS, _SIGNIFICANT_MASS_DEVIATIONS = 0.010, 4.0, 20.0
+_MAX_ABSENT_MASS_KG, _ABSENT_MASS_DEVIATIONS, _SIGNIFICANT_DEVIATIONS = 0.010, 4.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +274,7 @@ class Explanation:
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
-        always_estimated: quantities such as "gravity", which are no causes.
+        always_fitted: quantities such as "gravity", which are no causes.
     """
 
     causes: tuple[Cause, ...]
@@ -311,7 +286,7 @@ class Explanation:
     loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
     state: State
-    always_estimated: tuple[str, ...] = ()
+    always_fitted: tuple[str, ...] = ()
 
     @property
     def is_misfit(self) -> bool:
@@ -326,21 +301,19 @@ class Explanation:
 
 
 def explain_misfit(
-    data: Instants,
-    with_delay: InstantsAtDelay | None = None,
-    always_estimated: tuple[str, ...] = (),
+    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    The model contains the extensions `always_estimated`, such as "weight", from the start.
+    The model contains the extensions `always_fitted`, such as "weight", from the start.
     `with_delay` returns the record with an additional delay [s].
     """
     with one_blas_thread():
-        state, delay_s, rejected = search_causes(data, with_delay, always_estimated)
-        blocks = jackknife_deviations_over_parts(state)
+        state, delay_s, rejected = search_causes(data, with_delay, always_fitted)
+        blocks = jackknife_over_parts(state)
         gains = gain_covariance(state) + torque_unit_covariance(state)
         covariance = load_covariance(state, rejected, blocks, gains)
-        causes = causes_of_fit(state, always_estimated)
+        causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
         if (
             not causes
@@ -361,7 +334,7 @@ def explain_misfit(
             loads=tuple(loads_between_changes(state, covariance)),
             removed_weight=removed,
             state=state,
-            always_estimated=always_estimated,
+            always_fitted=always_fitted,
         )
 
 
@@ -369,7 +342,7 @@ def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     least = max(
         _ABSENT_MASS_DEVIATIONS * deviation,
-        min(_MAX_ABSENT_MASS_KG, _SIGNIFICANT_MASS_DEVIATIONS * deviation),
+        min(_MAX_ABSENT_MASS_KG, _SIGNIFICANT_DEVIATIONS * deviation),
     )
     return bool(mass < least and deviation < 0.1)
 

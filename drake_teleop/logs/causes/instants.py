@@ -21,31 +21,25 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 
 MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
-CONSTANT_COLUMN, SPECIFIC_FORCE, GRAVITY, ANGULAR_ACCELERATION, OMEGA_PRODUCTS = (
-    0,
-    slice(1, 4),
-    slice(4, 7),
-    slice(7, 10),
-    slice(10, 16),
-)
-WRENCH, WRENCH_RATE, ROTATION, ROTATION_TIMES_POSITION, TIME_POLYNOMIALS = (
-    slice(16, 22),
-    slice(22, 28),
-    slice(28, 37),
-    slice(37, 64),
-    slice(64, 67),
-)
+CONSTANT_COLUMN = 0
+SPECIFIC_FORCE = slice(1, 4)
+GRAVITY = slice(4, 7)
+ALPHA = slice(7, 10)
+OMEGA_PRODUCTS = slice(10, 16)
+WRENCH = slice(16, 22)
+WRENCH_RATE = slice(22, 28)
+ROTATION = slice(28, 37)
+R_P_PRODUCTS = slice(37, 64)
+TIME_POLYNOMIALS = slice(64, 67)
 NUM_SIGNALS = 67
 MOTION_COLUMNS = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _INSTANT_RATE_HZ, _MAX_ROWS = 50.0, 20_000
 _BLOCK_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
-_MAX_EXACTLY_AVERAGED_SAMPLES, _MIN_ACCELERATION_OVER_NOISE, _MAX_ALPHA_NOISE_SHARE = (
-    5,
-    4.0,
-    1.0 / 64.0,
-)
-_ALPHA_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular acceleration [rows]
+_MAX_EXACTLY_AVERAGED_SAMPLES = 5
+_MIN_ACCELERATION_OVER_NOISE = 4.0
+_MAX_ALPHA_NOISE_SHARE = 1.0 / 64.0
+_ALPHA_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
 _MIN_WRENCH_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
 _LOAD_SIGNAL_COLUMNS = slice(0, 16)
@@ -109,9 +103,7 @@ class Instants:
             parts.append(self.y[:, MOTION_COLUMNS] * share[:, None])
         return np.hstack(parts)
 
-    def block_sums_of_lagged_products(
-        self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1
-    ) -> Array:
+    def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
         """Return sums over blocks of products of y (M, W) with earlier y, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
@@ -151,9 +143,8 @@ def block_means_of_record(
     y[1:-1, WRENCH_RATE] = (y[2:, WRENCH] - y[:-2, WRENCH]) / (2.0 * size * dt)
     positions = _write_motion(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
-    y[:, TIME_POLYNOMIALS] = np.stack(
-        [x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1
-    )  # Legendre
+    # Legendre polynomials.
+    y[:, TIME_POLYNOMIALS] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
     used = np.ones(rows, bool)
     used[[0, -1]] = False
     if lost is not None:
@@ -172,16 +163,13 @@ def block_means_of_record(
 def _smooth_noisy_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
-    alpha = y[used][:, ANGULAR_ACCELERATION]
+    alpha = y[used][:, ALPHA]
     share = _smallest_noise_share(alpha)
     for width in _ALPHA_SMOOTHING_WIDTHS:
         if _smallest_noise_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
-        alpha = savgol_filter(y[used][:, ANGULAR_ACCELERATION], width, 2, axis=0)
-    y[
-        np.flatnonzero(used)[:, None],
-        np.arange(ANGULAR_ACCELERATION.start, ANGULAR_ACCELERATION.stop),
-    ] = alpha
+        alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
+    y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
     return share
 
 

@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
-from drake_teleop.logs.causes.instants import ANGULAR_ACCELERATION, WRENCH, white_noise_deviations
+from drake_teleop.logs.causes.instants import ALPHA, WRENCH, white_noise_deviations
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
 from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
@@ -19,19 +19,15 @@ _NUM_JACKKNIFE_PARTS = 12
 _TOLERATED_JACKKNIFE_RATIO, _USUAL_JACKKNIFE_RATIO = 1.5, 1.15
 _GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
 _MIN_INCLUDED_SCORE, _FULLY_INCLUDED_SCORE, _FULLY_INCLUDED_RESIDUAL_SHARE = 6.0, 15.0, 0.5
-_CABLE_DEVIATION_FACTOR, _LARGE_RESIDUAL_RATIO, _CLEAR_SMOOTH_MISFIT, _LARGE_SMOOTH_MISFIT = (
-    1.5,
-    20.0,
-    2.2,
-    6.0,
-)
+_CABLE_DEVIATION_FACTOR = 1.5
+_LARGE_RESIDUAL_RATIO = 20.0
+_CLEAR_SMOOTH_MISFIT = 2.2
+_LARGE_SMOOTH_MISFIT = 6.0
 _CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
 """Causes whose effects are included in the jackknife."""
-_TRIED_GAIN_DEVIATIONS, _MIN_LIKELIHOOD_GAIN, _MIN_SHARE_EXPLAINED_BY_GAINS = (
-    np.geomspace(1e-4, 0.1, 31),
-    20.0,
-    0.5,
-)
+_TRIED_GAIN_DEVIATIONS = np.geomspace(1e-4, 0.1, 31)
+_MIN_LIKELIHOOD_GAIN = 20.0
+_MIN_SHARE_EXPLAINED_BY_GAINS = 0.5
 _MAX_GAIN_DEVIATION = 0.025
 
 
@@ -126,10 +122,8 @@ def torque_unit_covariance(state: State) -> Array:
 def attenuation_bias(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
-    at = np.searchsorted(
-        state.rows.columns, np.arange(ANGULAR_ACCELERATION.start, ANGULAR_ACCELERATION.stop)
-    )
-    variance = white_noise_deviations(data.y[data.used][:, ANGULAR_ACCELERATION]) ** 2
+    at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
+    variance = white_noise_deviations(data.y[data.used][:, ALPHA]) ** 2
     weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
     J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
@@ -151,7 +145,7 @@ def misfit_deviation_factor(state: State, blocks: Array) -> float:
     )
 
 
-def jackknife_deviations_over_parts(state: State) -> Array:
+def jackknife_over_parts(state: State) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)

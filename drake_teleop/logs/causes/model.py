@@ -13,14 +13,14 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
-    ANGULAR_ACCELERATION,
+    ALPHA,
     CONSTANT_COLUMN,
     GRAVITY,
     MOTION_COLUMNS,
     NUM_SIGNALS,
     OMEGA_PRODUCTS,
+    R_P_PRODUCTS,
     ROTATION,
-    ROTATION_TIMES_POSITION,
     SPECIFIC_FORCE,
     TIME_POLYNOMIALS,
     WRENCH,
@@ -106,7 +106,7 @@ class Model:
         wide = bool({"gravity", "cable"} & set(self.extensions))
         kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
-            kept[ROTATION], kept[ROTATION_TIMES_POSITION] = False, False
+            kept[ROTATION], kept[R_P_PRODUCTS] = False, False
             for i in range(len(self.steps)):
                 kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
         return np.flatnonzero(kept)
@@ -180,7 +180,7 @@ class Model:
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
         for rows, where in (
             (slice(0, 3), SPECIFIC_FORCE),
-            (slice(3, 6), ANGULAR_ACCELERATION),
+            (slice(3, 6), ALPHA),
             (slice(6, 12), OMEGA_PRODUCTS),
         ):
             M[:, rows, where] = np.eye(rows.stop - rows.start)
@@ -190,7 +190,7 @@ class Model:
                 M[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
-            M[:, :3, ANGULAR_ACCELERATION] -= cross_matrix(r)
+            M[:, :3, ALPHA] -= cross_matrix(r)
             M[:, :3, OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
 
@@ -229,8 +229,6 @@ def _cable_coefficients(x: Array) -> Array:
     K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
     for i in range(3):
         out[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = x[:, :3]
-        out[
-            :, i, ROTATION_TIMES_POSITION.start + 9 * i : ROTATION_TIMES_POSITION.start + 9 * i + 9
-        ] = K.reshape(-1, 9)
+        out[:, i, R_P_PRODUCTS.start + 9 * i : R_P_PRODUCTS.start + 9 * i + 9] = K.reshape(-1, 9)
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

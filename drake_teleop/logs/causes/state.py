@@ -12,8 +12,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.instants import (
     MAX_NOISE_LAG,
     OMEGA_PRODUCTS,
+    R_P_PRODUCTS,
     ROTATION,
-    ROTATION_TIMES_POSITION,
     WRENCH,
     Instants,
 )
@@ -44,7 +44,7 @@ class UsedRows:
     @cached_property
     def lagged_product_sums(self) -> Array:
         """Sums (5, W, W) of products of W signals at lags of 0 to 4 rows."""
-        return np.asarray(self.data.block_sums_of_lagged_products(self.y, rows=len(self.y))[0])
+        return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def rows_with_predecessors(self) -> NDArray[np.intp]:
@@ -280,7 +280,7 @@ class State:
             [
                 y[:, : OMEGA_PRODUCTS.stop],
                 y[:, ROTATION] if self.data.gravity_W is not None else y[:, :0],
-                y[:, ROTATION_TIMES_POSITION] @ _stiffness_signals().T
+                y[:, R_P_PRODUCTS] @ _stiffness_signals().T
                 if self.data.has_positions
                 else y[:, :0],
                 part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
@@ -293,7 +293,7 @@ class State:
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = quadratic_likelihood_gain(x.T @ x, x.T @ white)
+            solved, rank = first_order_gain(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
 
@@ -302,14 +302,12 @@ class State:
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
         residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
-        return quadratic_likelihood_gain(
+        return first_order_gain(
             *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
         )[0]
 
 
-def quadratic_likelihood_gain(
-    gram: Array, right: Array, least: Array | float = 0.0
-) -> tuple[float, int]:
+def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())

@@ -37,18 +37,16 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-GOOD_UNEXPLAINED_SHARE = 0.02
+GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-VALID_UNEXPLAINED_SHARE = 0.05
+VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _LOAD_FIT_CUTOFF_HZ = 15.0
-_FINDINGS_INCLUDING_SIGN = (
-    "sign",
-    "swapped axes",
-)  # mirrored axes are a cause that `identify` names
+_FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
+"""Findings with the sign; mirrored axes are a cause that `identify` names."""
 _CONTACT_FREE_SHARE = 0.75
 """Share of a record that is without contact, if any is."""
 _MAX_FITTED_SAMPLES = 1500
@@ -72,7 +70,7 @@ class LoadFit:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED_SHARE + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
@@ -83,7 +81,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     wrench = smooth.wrench[rows]
     scale = _channel_scales(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
-    if "weight" in log.estimated_quantities and smooth.gravity is not None:
+    if "weight" in log.estimated and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
         V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
     V, w = V / scale[:, None], wrench / scale
@@ -204,7 +202,7 @@ def _better_edits(
             negative.append((fit, *with_opposite_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = (
-        VALID_UNEXPLAINED_SHARE + given.noise,
+        VALID_UNEXPLAINED + given.noise,
         given.unexplained / min_reduction_factor(given),
     )
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
@@ -252,7 +250,7 @@ def _findings_without_remedy(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED_SHARE + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.

@@ -80,11 +80,7 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
             if (
                 unit != sensor.unit
                 and 0.7
-                < (
-                    ratio
-                    / description.si_value_of_unit(sensor.unit)
-                    * description.si_value_of_unit(unit)
-                )
+                < (ratio / description.unit_in_si(sensor.unit) * description.unit_in_si(unit))
                 < 1.43
             ):
                 text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in"

@@ -85,7 +85,7 @@ _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_TIME_COLUMN_FIELDS = ("column", "nanoseconds")
+_STAMP_FIELDS = ("column", "nanoseconds")
 _COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -153,7 +153,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         | _find_quaternion(table, plain)
         | _find_array_columns(table, plain)
     )
-    _rename_torque_to_position(found, plain)
+    _torque_to_position(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
@@ -196,9 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
     times = {
-        stream.get("time", {}).get(name)
-        for stream in draft.values()
-        for name in _TIME_COLUMN_FIELDS
+        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
     }
     used |= times - {None}
     arrays = _names_of_array_columns(table)
@@ -271,9 +269,7 @@ def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColu
     return {}
 
 
-def _rename_torque_to_position(
-    found: dict[str, _UnitColumns], plain: dict[str, tuple[str, str]]
-) -> None:
+def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[str, str]]) -> None:
     torque = found.get("torque", _NO_COLUMNS).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:

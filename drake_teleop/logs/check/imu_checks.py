@@ -7,9 +7,9 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.logs.check.against_load import (
-    GOOD_UNEXPLAINED_SHARE,
+    GOOD_UNEXPLAINED,
     MIN_IMPROVEMENT,
-    VALID_UNEXPLAINED_SHARE,
+    VALID_UNEXPLAINED,
 )
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
@@ -205,29 +205,25 @@ def check_imu_against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if (
-        given.unexplained > GOOD_UNEXPLAINED_SHARE
-        or given.is_mirrored
-        or given.rotation_angle_deg > 10
-    ):
+    if given.unexplained > GOOD_UNEXPLAINED or given.is_mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
             if (found := result_for_edit_or_none(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(VALID_UNEXPLAINED_SHARE, given.unexplained / MIN_IMPROVEMENT)
+        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_IMPROVEMENT)
         if given.is_mirrored:
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED_SHARE:
+        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-            limit = min(VALID_UNEXPLAINED_SHARE, 1.5 * given.unexplained + 1e-4)
+            limit = min(VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
             findings.append(best[1])
             description, given = best[2], best[3]
-    if given.unexplained > VALID_UNEXPLAINED_SHARE and not given.is_mirrored:
+    if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
         finding, description = _correct_imu_clock(description, given, data)

@@ -20,7 +20,7 @@ from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_O
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
-_ACCELERATION_CUTOFF_HZ = 3.0
+_CUTOFF_HZ = 3.0
 _MAX_CONDITION_NUMBER = 1e8
 _MIN_REPORTED_SHIFT_M, _MAX_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _SIGNIFICANT_DEVIATIONS = 5.0  # standard deviations
@@ -38,12 +38,10 @@ _WRONG_TORQUE_UNIT_RATIOS = (
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_COM_ERROR_TOLERANCE = 0.03
+_COM_TOLERANCE = 0.03
 
 
-def position_unit_or_frame_finding(
-    description: Description, data: LogData, lag: float
-) -> list[Finding]:
+def position_findings(description: Description, data: LogData, lag: float) -> list[Finding]:
     """Return findings for positions in a wrong unit, or of a point other than So.
 
     They are compared with the accelerometer, whose clock lags the pose's by `lag` [s].
@@ -66,10 +64,10 @@ def position_unit_or_frame_finding(
     turning = np.stack([cross_matrix(w) @ cross_matrix(w) for w in omega])
     turning += np.stack([cross_matrix(x) for x in alpha])
     columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
-    columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
+    columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     fit = _fit_centred_signals(
-        columns[inner], by_pose[inner], 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
+        columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0])
     )
     if fit is None or abs(fit[0][0]) <= _SIGNIFICANT_DEVIATIONS * fit[1][0]:
         return []
@@ -186,7 +184,7 @@ def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS]
     return not _MIN_COM_DISTANCE_M < size < _MAX_COM_DISTANCE_M or bool(
-        min(off) < _COM_ERROR_TOLERANCE * size
+        min(off) < _COM_TOLERANCE * size
     )
 
 

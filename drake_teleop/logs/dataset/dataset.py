@@ -39,11 +39,7 @@ from drake_teleop.logs.dataset.dataset_files import (
     open_dataset,
     write_copy,
 )
-from drake_teleop.logs.dataset.episode_faults import (
-    EpisodeFault,
-    faults_of_hypothesis,
-    saturation_faults,
-)
+from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
@@ -72,10 +68,7 @@ _MAX_CALIBRATION_FRAMES = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
 _MAX_EXCESS_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
-_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = (
-    2,
-    20,
-)  # frames around contact; free frames for the offsets
+_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
@@ -261,7 +254,7 @@ def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tu
         )
     assert described.wrench is not None
     clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
-    at = np.interp(np.arange(clock.num_table_rows), clock.table_rows, clock.t - clock.t[0])
+    at = np.interp(np.arange(clock.num_rows), clock.kept_rows, clock.t - clock.t[0])
     return log, at
 
 
@@ -344,7 +337,7 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
     )
     residual = unexplained_reading(found, predict, signals.regressor_at_lag)
     faults: list[EpisodeFault] = saturation_faults(log.wrench)
-    faults += faults_of_hypothesis(found, shared.lag_frames, shared.phi, 1.0 / log.dt)
+    faults += name_faults(found, shared.lag_frames, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
     if step is not None:

@@ -29,9 +29,7 @@ class EpisodeFault(NamedTuple):
     value: Any
 
 
-def faults_of_hypothesis(
-    x: Hypothesis, usual_lag: float, known: Array, fps: float
-) -> list[EpisodeFault]:
+def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[EpisodeFault]:
     """Return the faults of an episode that a hypothesis contains.
 
     `usual_lag` [frames] is that of other episodes, `known` (10,) the usual load.

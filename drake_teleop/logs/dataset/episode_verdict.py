@@ -30,12 +30,10 @@ HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
-_FORCE_CHANNELS, _TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
+_FORCE, _TORQUE = slice(0, 3), slice(3, 6)
 _REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
-_COST_PER_DEVIATION, _COST_TIMES_FRAMES = (
-    0.25,
-    40.0,
-)  # required reduction of the log spread, for each deviation
+# Required reduction of the log spread, for each deviation.
+_COST_PER_DEVIATION, _COST_TIMES_FRAMES = 0.25, 40.0
 _NUM_START_PARTS = 4
 _MIN_HALF_WIDTH_SHARE = 0.3
 _INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
@@ -113,7 +111,7 @@ def find_hypothesis(
     for kind in HYPOTHESIS_KINDS:
         lags = {
             usual_lag,
-            search.lag_of_least_spread(replace(usual, kind=kind)),
+            search.best_lag(replace(usual, kind=kind)),
             search.lag_of_linear_fit(kind),
         }
         for lag in lags:
@@ -121,9 +119,7 @@ def find_hypothesis(
             found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
-        found.append(
-            search.with_spread_and_cost(replace(best, lag=search.lag_of_least_spread(best)))
-        )
+        found.append(search.with_spread_and_cost(replace(best, lag=search.best_lag(best))))
     return min(found, key=lambda x: x.cost)
 
 
@@ -161,10 +157,7 @@ class HypothesisSearch:
 
     def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
-        force, torque = (
-            self.best_permutation(*both, channels)
-            for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
-        )
+        force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
         yield self.with_spread_and_cost(
@@ -219,7 +212,7 @@ class HypothesisSearch:
             if scale:
                 ratio = [
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
+                    for c in (_FORCE, _TORQUE)
                 ]
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
@@ -251,7 +244,7 @@ class HypothesisSearch:
             rows, weights = self._best_rows_of(x), np.exp(-x.spread)
         return x
 
-    def lag_of_least_spread(self, x: Hypothesis) -> float:
+    def best_lag(self, x: Hypothesis) -> float:
         """Return the lag [frames] with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
@@ -289,7 +282,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
-    for channels, factor in zip((_FORCE_CHANNELS, _TORQUE_CHANNELS), gain, strict=True):
+    for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
         H += w[:, channels].T @ p[:, channels] * factor / size**2
     U, _, Vt = np.linalg.svd(H)
@@ -298,7 +291,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
+    for channels, M in ((_FORCE, x.force_axes), (_TORQUE, x.torque_axes)):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)

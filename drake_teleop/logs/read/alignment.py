@@ -258,7 +258,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     return _refine_shift(cost, float(shifts[best]), step)
 
 
-def given_or_estimated_delay(
+def choose_delay(
     log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
     """Return the delay of the motion behind the wrench [s], and its source; `delay` may be "auto".

@@ -19,10 +19,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 
-_MAX_NUMBERS_PER_ARRAY, _MAX_NUMBERS_PER_ROW = (
-    2**28,
-    64,
-)  # numbers of an array, and of one row: wider ones are images
+_MAX_ARRAY_NUMBERS, _MAX_NUMBERS_PER_ROW = 2**28, 64  # arrays with wider rows are images
 
 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
@@ -66,9 +63,9 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
         or math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW
     ):
         return False
-    if math.prod(shape) > _MAX_NUMBERS_PER_ARRAY:
+    if math.prod(shape) > _MAX_ARRAY_NUMBERS:
         raise ValueError(
-            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_NUMBERS_PER_ARRAY:.2g})"
+            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_ARRAY_NUMBERS:.2g})"
         )
     return True
 
@@ -84,21 +81,12 @@ def import_optional_module(name: str, path: Path) -> Any:
         ) from None
 
 
-(
-    _MAT_HEADER_BYTES,
-    _MATRIX_TYPE,
-    _COMPRESSED_TYPE,
-    _STRUCTURE_CLASS,
-    _COMPLEX_FLAG,
-    _MAX_STRUCTURE_DEPTH,
-) = (
-    128,
-    14,
-    15,
-    2,
-    1 << 11,
-    20,
-)
+_MAT_HEADER_BYTES = 128
+_MATRIX_TYPE = 14
+_COMPRESSED_TYPE = 15
+_STRUCTURE_CLASS = 2
+_COMPLEX_FLAG = 1 << 11
+_MAX_STRUCTURE_DEPTH = 20
 _MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
@@ -155,9 +143,8 @@ def _add_mat_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
     parts = list(_iterate_mat_elements(content, order)) if kind == _MATRIX_TYPE else []
-    if (
-        len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE_TYPES
-    ):  # objects have no size
+    # Objects have no size.
+    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE_TYPES:
         return
     if depth > _MAX_STRUCTURE_DEPTH:
         raise ValueError(_DAMAGED_FILE_MESSAGE)

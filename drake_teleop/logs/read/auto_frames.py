@@ -80,10 +80,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
 
 
 def _unexplained_shares_text(found: Mounting) -> str:
-    shares = {
-        "specific force": found.unexplained,
-        "angular velocity": found.unexplained_angular_velocity,
-    }
+    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_omega}
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
 

@@ -34,10 +34,8 @@ _MESSAGES_PER_BLOCK, _RECEPTION_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_MEMORY_BYTES = 1_500_000_000  # bytes
-_TOO_LARGE_MESSAGE, _TOO_LARGE_REMEDY = (
-    "its uncompressed size is too large",
-    "cut it, or write the topics one by one",
-)
+_TOO_LARGE_MESSAGE = "its uncompressed size is too large"
+_CUT_REMEDY = "cut it, or write the topics one by one"
 _VECTOR_FIELDS = (
     "force",
     "torque",
@@ -124,9 +122,7 @@ def read_stream_table(stream: Wrench | Imu | Pose | Static) -> Table:
     return read_table(stream.file, header=stream.header)
 
 
-def draft_bag_description(
-    path: Path, topics: Sequence[Topic], folder: Path
-) -> tuple[dict[str, Any], list]:
+def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dict[str, Any], list]:
     """Return a draft log description with paths relative to `folder`, and its comment lines."""
     draft: dict[str, Any] = {}
     others: list[str] = []
@@ -186,9 +182,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(
-            _TOO_LARGE_MESSAGE, where=str(path), remedy=_TOO_LARGE_REMEDY
-        ) from None
+        raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY) from None
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -208,9 +202,7 @@ def _check_unpacked_size(path: Path) -> None:
             total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK_OPCODE else 0
             file.seek(min(length - 24, limit), 1)
             if total > limit:
-                raise DrakeTeleopError(
-                    _TOO_LARGE_MESSAGE, where=str(path), remedy=_TOO_LARGE_REMEDY
-                )
+                raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY)
 
 
 @contextmanager

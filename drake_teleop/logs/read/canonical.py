@@ -67,7 +67,7 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        estimated_quantities: those of "gravity" and "weight" that are estimated from the data.
+        estimated: those of "gravity" and "weight" that are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
 
     Raises:
@@ -90,7 +90,7 @@ class Log:
     gravity_W: Array | None = None
     one_sided_s: float = 0.0
     described: Description | None = None
-    estimated_quantities: tuple[str, ...] = ()
+    estimated: tuple[str, ...] = ()
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
-MIN_TIME_BETWEEN_EPISODES_S = 1.0
+EPISODE_SPACING_S = 1.0
 """Least time between two episodes of a file [s]."""
 MIN_GAP_STEPS = 4.0
 """Least length of a gap in median steps."""
@@ -33,21 +33,21 @@ class Clock:
     """Increasing times t (N,) of the rows of a stream on the common clock [s].
 
     Attributes:
-        table_rows: (N,) row of the table for each time.
-        num_table_rows: number of the table's rows, with removed ones.
+        kept_rows: (N,) row of the table for each time.
+        num_rows: number of the table's rows, with removed ones.
         notes: sentences about corrections.
         num_episodes: number of times at which the clock starts.
     """
 
     t: Array
-    table_rows: NDArray[np.intp]
-    num_table_rows: int
+    kept_rows: NDArray[np.intp]
+    num_rows: int
     notes: tuple[str, ...] = ()
     num_episodes: int = 1
 
     def select_timed_rows(self, x: Array) -> Array:
-        """Return the rows of x (num_table_rows, ...) that have a time."""
-        return x if len(self.table_rows) == self.num_table_rows else x[self.table_rows]
+        """Return the rows of x (num_rows, ...) that have a time."""
+        return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
@@ -151,9 +151,7 @@ def join_episodes(t: Array) -> tuple[Array, int]:
         return t, 1
     joined = known.copy()
     for start in back:
-        joined[start:] += (
-            joined[start - 1] + max(MIN_TIME_BETWEEN_EPISODES_S, 10.0 * step) - joined[start]
-        )
+        joined[start:] += joined[start - 1] + max(EPISODE_SPACING_S, 10.0 * step) - joined[start]
     result = t.copy()
     result[finite] = joined
     return result, len(back) + 1

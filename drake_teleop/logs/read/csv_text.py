@@ -24,7 +24,7 @@ _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
-_DECIMAL_COMMA_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
@@ -49,7 +49,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
         source = b"\n".join([b" ".join(line.split()) for line in aligned])
         rest = [" ".join(line.split()) for line in rest]
-    names = _column_names_in_comment(lines[:before], rest, separator) if header else None
+    names = _names_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
     parse = partial(
         pl.read_csv,
@@ -57,11 +57,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         has_header=header,
         separator=separator,
         decimal_comma=separator in ";\t"
-        and any(
-            _DECIMAL_COMMA_PATTERN.fullmatch(cell)
-            for line in rest
-            for cell in line.split(separator)
-        ),
+        and any(_DECIMAL_COMMA.fullmatch(cell) for line in rest for cell in line.split(separator)),
         skip_lines=before,
         try_parse_dates=True,
     )
@@ -110,9 +106,7 @@ def _find_separator(line: str) -> str:
     return " " if "," not in bare and " " in bare else ","
 
 
-def _column_names_in_comment(
-    comments: list[str], rest: list[str], separator: str
-) -> list[str] | None:
+def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
     marked = [line for line in comments if line.startswith("#")]
     if not marked or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None

@@ -334,7 +334,7 @@ class Description(StrictModel):
         rotation = np.eye(3) if rotation is None else rotation
         return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
 
-    def si_value_of_unit(self, unit: str) -> float:
+    def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
 

@@ -114,10 +114,10 @@ def _unexplained_share(y: Array, x: Array) -> float:
 _NUM_JACKKNIFE_BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.
 MIN_SINGULAR_RATIO = 1e-5
-_MAX_SOLVER_EVALUATIONS = 15  # evaluations of the solver: valid records need six
+_MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def solve_nonlinear_least_squares(
+def nonlinear_least_squares(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
@@ -149,7 +149,7 @@ def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Arr
         return np.hstack([found, known])
 
     return least_squares(
-        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_SOLVER_EVALUATIONS
+        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS
     )
 
 
@@ -228,7 +228,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     target = (wrench - wrench.mean(axis=0)).ravel()
     phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve_nonlinear_least_squares(
+    x, deviations = nonlinear_least_squares(
         residual_at, np.concatenate([np.zeros(4), offsets, phi])
     )
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
@@ -265,7 +265,7 @@ MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
 """Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
 MAX_ROTATION_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
-MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS = 0.005
+MAX_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_LAG_S = 1.0
 
@@ -280,7 +280,7 @@ class Mounting:
         mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
             [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained, unexplained_angular_velocity: unexplained shares of the variance of specific
+        unexplained, unexplained_omega: unexplained shares of the variance of specific
             force and angular velocity (None without a gyroscope).
         is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
@@ -294,7 +294,7 @@ class Mounting:
     mid_record_time_s: float
     drift: float
     unexplained: float
-    unexplained_angular_velocity: float | None
+    unexplained_omega: float | None
     is_mirrored: bool
     speed_ratio: float | None
     deviations_deg: Array
@@ -322,18 +322,14 @@ class Mounting:
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
-            self.unexplained_angular_velocity is None
-            or self.unexplained_angular_velocity < MAX_UNEXPLAINED_SHARE
+            self.unexplained_omega is None or self.unexplained_omega < MAX_UNEXPLAINED_SHARE
         )
         if self.lever is not None:
             return (
                 not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
             )
         # Without positions the pose determines the angular velocity, but not the acceleration.
-        known = (
-            self.unexplained_angular_velocity is not None
-            or self.unexplained < MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS
-        )
+        known = self.unexplained_omega is not None or self.unexplained < MAX_SHARE_WITHOUT_POSITIONS
         return not self.is_mirrored and omega_agrees and known
 
     @property
@@ -370,9 +366,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
     middle, drift = estimate_clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
-    R, mirrored = _fit_rotation_by_kabsch(
-        resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected
-    )
+    R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
@@ -399,7 +393,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         mid_record_time_s=centre,
         drift=drift,
         unexplained=shares[0],
-        unexplained_angular_velocity=shares[1] if len(shares) > 1 else None,
+        unexplained_omega=shares[1] if len(shares) > 1 else None,
         is_mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
@@ -431,11 +425,11 @@ def _refine_rotation_and_lag(
     linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
     linear[:, :3, :3] = -K
     linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve_nonlinear_least_squares(pose_residual, first, linear)
+    x, deviations = nonlinear_least_squares(pose_residual, first, linear)
     return x, deviations, pose_residual(x)
 
 
-def _fit_rotation_by_kabsch(x: Array, y: Array) -> tuple[Array, bool]:
+def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
     """Return the R that minimises |y - R x - b|, and whether a reflection fits clearly better."""
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)

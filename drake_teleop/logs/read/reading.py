@@ -48,10 +48,10 @@ from drake_teleop.logs.read.streams import (
     OrientationColumns,
     Stream,
     resample_to_clock,
-    rotate_world_to_S,
-    rotate_wrench_world_to_S,
     specific_force_at_So,
     uniform_times_of_streams,
+    world_to_S,
+    wrench_world_to_S,
 )
 from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table, decimal_resolution
@@ -60,7 +60,7 @@ MIN_STATIC_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
 _MIN_GAP_OVER_STEP = 4.0
-_EstimateAutoFields = Callable[..., tuple[Description, tuple[str, ...]]]
+_EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
 def read_log(
@@ -147,7 +147,7 @@ class _LogReader:
             self._replace_auto_fields(estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
-        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_table_rows)
+        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_rows)
         wrench = clock.select_timed_rows(wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -159,9 +159,7 @@ class _LogReader:
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
-        log = replace(
-            log, gain_std=gain_std, estimated_quantities=free, described=self._description
-        )
+        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
             log = replace(
@@ -172,18 +170,14 @@ class _LogReader:
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restore_weight(log, np.array(weight), self._read_with_other_description(other))
+        return restore_weight(log, np.array(weight), self._read_edited_log(other))
 
-    def _replace_auto_fields(
-        self, describe: _EstimateAutoFields, *, differentiate: bool = True
-    ) -> None:
-        read = partial(self._read_with_other_description, differentiate=differentiate)
+    def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
+        read = partial(self._read_edited_log, differentiate=differentiate)
         self._description, notes = describe(self._description, self._source, read)
         self._notes += notes
 
-    def _read_with_other_description(
-        self, description: Description, *, differentiate: bool = True
-    ) -> Log:
+    def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table_of_stream(stream)
@@ -212,9 +206,7 @@ class _LogReader:
         where = f"{self._source}:{name}.{field}.columns"
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= (
-            sign * self._description.si_value_of_unit(quantity.unit) * np.array(quantity.scale)
-        )
+        values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
         is_table = Path(self._source).suffix.lower() in TABLE_READERS
         of_table = f" ({YAML_ONLY_NOTE})" if is_table else ""
         remedy = (
@@ -245,7 +237,7 @@ class _LogReader:
         return Stream(
             "pose",
             t,
-            rotate_world_to_S(R_WS, acceleration - self._description.gravity_W),
+            world_to_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
             raw,
@@ -256,18 +248,16 @@ class _LogReader:
         position = None
         if stream.position is not None:
             position = self._read_vectors(
-                "pose", "position", stream.position, table, clock.num_table_rows
+                "pose", "position", stream.position, table, clock.num_rows
             )
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
-        orientations = OrientationColumns(
-            self._description, form, table, clock.num_table_rows, where
-        )
-        quaternion = orientations.allocate_quaternions(len(clock.table_rows))
+        orientations = OrientationColumns(self._description, form, table, clock.num_rows, where)
+        quaternion = orientations.allocate_quaternions(len(clock.kept_rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CONVERTED_CHUNK_ROWS):
             part = slice(start, start + _CONVERTED_CHUNK_ROWS)
-            q = orientations.quaternions(clock.table_rows[part])
+            q = orientations.quaternions(clock.kept_rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
@@ -288,7 +278,7 @@ class _LogReader:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
-            values = self._read_vectors("imu", field, quantity, table, clock.num_table_rows, sign)
+            values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
             return self._rotate_to_S("imu", stream.frame, values, t, pose)
 
@@ -313,10 +303,10 @@ class _LogReader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._missing_orientation_error(name)
-        return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+            raise self._no_orientation_error(name)
+        return world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _missing_orientation_error(
+    def _no_orientation_error(
         self, name: str, remedy: str = "add a pose stream"
     ) -> DrakeTeleopError:
         return DrakeTeleopError(
@@ -344,8 +334,8 @@ class _LogReader:
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._missing_orientation_error("static", remedy)
-            wrench = rotate_wrench_world_to_S(R_SW, wrench)
+                raise self._no_orientation_error("static", remedy)
+            wrench = wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
@@ -370,7 +360,7 @@ class _LogReader:
             decimal_resolution(
                 table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
             )
-            * (self._description.si_value_of_unit(quantity.unit) * np.abs(quantity.scale).max())
+            * (self._description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
         return force, torque
@@ -427,9 +417,9 @@ class _LogReader:
             R_WS = nearest_rotation(resample_to_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             if in_base:
-                wrench = rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._missing_orientation_error("wrench")
+            raise self._no_orientation_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(

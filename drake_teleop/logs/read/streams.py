@@ -64,11 +64,11 @@ def resample_to_clock(t: Array, stream: Stream, values: Array) -> Array:
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
-def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
+def world_to_S(R_WS: Array, vectors_W: Array) -> Array:
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
+def wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
@@ -106,7 +106,7 @@ class OrientationColumns:
         width = NUM_COLUMNS_OF_FORM[orientation.form]
         self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.si_value_of_unit(orientation.unit)
+            self._columns *= description.unit_in_si(orientation.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
         """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
