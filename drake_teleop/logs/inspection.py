@@ -140,10 +140,7 @@ def _inspect_described_log(
 ) -> list[Finding]:
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
-    for name in ("wrench", "imu", "pose", "static"):
-        stream = getattr(description, name)
-        if stream is None:
-            continue
+    for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_numbers(stream.columns)

@@ -43,7 +43,7 @@ _ALPHA_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # windows for a noisy angular accelera
 _MIN_WRENCH_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
 _LOAD_SIGNAL_COLUMNS = slice(0, 16)
-_PRODUCT_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SYMMETRIC_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 MotionAtTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
@@ -217,7 +217,7 @@ def _write_signal_columns(y: Array, columns: Array) -> None:
 
 def _signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     s, omega, alpha = motion[:3]
-    products = np.stack([omega[:, i] * omega[:, k] for i, k in _PRODUCT_AXES], axis=1)
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in SYMMETRIC_ENTRIES], axis=1)
     if len(motion) == 3 or gravity_W is None:
         return np.hstack([s, np.zeros_like(s), alpha, products])
     R_SW = np.swapaxes(motion[3], 1, 2)

@@ -14,6 +14,7 @@ from drake_teleop.logs.causes.instants import (
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
     ROTATION,
+    SYMMETRIC_ENTRIES,
     WRENCH,
     Instants,
 )
@@ -193,7 +194,6 @@ def regularized_inverse(gram: Array) -> Array:
 
 
 _NUM_SMOOTH_SEGMENTS = 6
-_STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +323,7 @@ def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> t
 
 def _stiffness_signals() -> Array:
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
+    for row, (j, k) in enumerate(SYMMETRIC_ENTRIES):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0

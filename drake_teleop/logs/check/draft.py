@@ -238,6 +238,16 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
+def _group_numbered_columns(
+    plain: dict[str, tuple[str, str]], pattern: str
+) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(pattern, words):
+            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    return groups
+
+
 def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     found: dict[str, _UnitColumns] = {}
     for kind, names in _VECTOR_NAME_PATTERNS.items():
@@ -277,10 +287,7 @@ def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[s
 
 
 def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(_POSE_VECTOR_PATTERN, words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
@@ -296,20 +303,14 @@ def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
 
 
 def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(_NUMBERED_QUATERNION_PATTERN, words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _have_unit_length(table, group)), None)
     return {"orientation": _UnitColumns(found, "")} if found else {}
 
 
 def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(r"\d$", words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, r"\d$")
     found: dict[str, _UnitColumns] = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)

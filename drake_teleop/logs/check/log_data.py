@@ -35,12 +35,11 @@ class LogData:
         self.tables = tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
-        streams = _described_streams(description)
-        for stream in streams.values():
+        for stream in description.streams.values():
             if stream.source not in tables:
                 tables[stream.source] = read_stream_table(stream)
             steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
-        for name, stream in streams.items():
+        for name, stream in description.streams.items():
             thin = self._thinned.setdefault(
                 stream.source,
                 replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
@@ -53,7 +52,7 @@ class LogData:
     def read_thinned_log(self, description: Description) -> Log:
         """Return the log at about 100 Hz, as a description defines it."""
         stamped = {}
-        for name, stream in _described_streams(description).items():
+        for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
                 column = {"column": f"{_TIME_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
@@ -107,11 +106,6 @@ class LogData:
                 thin.columns[column] = (
                     taken if field == "orientation" else _means_of_consecutive_rows(x, k)
                 )
-
-
-def _described_streams(description: Description) -> dict[str, Any]:
-    streams = {name: getattr(description, name) for name in ("wrench", "imu", "pose", "static")}
-    return {name: stream for name, stream in streams.items() if stream is not None}
 
 
 def _means_of_consecutive_rows(x: Array, k: int) -> Array:

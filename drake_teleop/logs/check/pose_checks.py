@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
+from drake_teleop.logs.read.auto_frames import round_for_yaml
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
@@ -168,12 +169,12 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
         texts.append(
             f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
         )
-        lines.append(f"pose.position_in_sensor: {_rounded_for_yaml(place)}")
+        lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.turned:
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
         deviation = float(frame.turn_deviations_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
-        lines.append(f"pose.rotation_in_sensor: {_rounded_for_yaml(frame.R_SP @ posed.R_SP)}")
+        lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
     return Finding(
         "pose frame",
         f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
@@ -186,7 +187,3 @@ def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     return not _MIN_COM_DISTANCE_M < size < _MAX_COM_DISTANCE_M or bool(
         min(off) < _COM_TOLERANCE * size
     )
-
-
-def _rounded_for_yaml(x: Array) -> list[Any]:
-    return list((np.round(x, 4) + 0.0).tolist())

@@ -51,7 +51,7 @@ def estimate_auto_imu_mounting(
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
             f"imu.position found: {_format_arm_mm(lever)} mm, from the {lever.source}; write it"
-            f" into the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
+            f" into the description as imu.position: {round_for_yaml(lever.p_SoIo_S)}"
         )
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
@@ -90,7 +90,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     std = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [
         f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
-        f" imu.frame: {_round_for_yaml(found.R_SI)}"
+        f" imu.frame: {round_for_yaml(found.R_SI)}"
     ]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
@@ -132,7 +132,7 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
     return lever
 
 
-def _round_for_yaml(x: Array) -> list:
+def round_for_yaml(x: Array) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
@@ -195,10 +195,9 @@ def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
 
 
 def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
-    written = (np.round(value, 4) + 0.0).tolist()
     return (
         f"pose.{name} found, standard deviation {deviation}; write it into the description as"
-        f" pose.{name}: {written}"
+        f" pose.{name}: {round_for_yaml(value)}"
     )
 
 
@@ -258,7 +257,7 @@ def estimate_auto_gravity(
             where=f"{source}:gravity",
             remedy="record the load in more orientations, without contact; or give the vector",
         )
-    gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
+    gravity = tuple(round_for_yaml(estimated))
     note = (
         f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"
         f" gravity: {list(gravity)}"

@@ -76,10 +76,9 @@ def list_topics(path: Path) -> list[Topic]:
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
-            Topic(name, info.msgtype or "several", info.msgcount, info.msgcount / seconds)
-            if seconds > 0
-            else Topic(name, info.msgtype or "several", info.msgcount, 0.0)
+            Topic(name, info.msgtype or "several", count, count / seconds if seconds > 0 else 0.0)
             for name, info in sorted(reader.topics.items())
+            for count in [info.msgcount]
         ]
 
 

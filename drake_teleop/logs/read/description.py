@@ -324,6 +324,12 @@ class Description(StrictModel):
             raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
 
     @property
+    def streams(self) -> dict[str, Any]:
+        """The described ones of wrench, imu, pose and static, by name."""
+        fields = ((name, getattr(self, name)) for name in ("wrench", "imu", "pose", "static"))
+        return {name: stream for name, stream in fields if stream is not None}
+
+    @property
     def gravity_W(self) -> Array:
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
@@ -372,8 +378,7 @@ def load_description(path: str | Path) -> Description:
 def _resolve_paths(description: Description, folder: Path) -> Description:
     streams = {
         name: stream.model_copy(update={"file": folder / stream.file})
-        for name in ("wrench", "imu", "pose", "static")
-        if (stream := getattr(description, name)) is not None
+        for name, stream in description.streams.items()
     }
     return description.model_copy(update=streams)
 

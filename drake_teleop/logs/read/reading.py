@@ -178,9 +178,8 @@ class _LogReader:
         self._notes += notes
 
     def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
-        for name in ("wrench", "imu", "pose"):
-            if (stream := getattr(self._description, name)) is not None:
-                self._table_of_stream(stream)
+        for stream in self._description.streams.values():
+            self._table_of_stream(stream)
         reader = _LogReader(description, self._source, 30.0, self._tables)
         return reader.read_recording(differentiate=differentiate)
 
@@ -381,8 +380,7 @@ class _LogReader:
             )
         found_gaps = find_gaps_in_times(t, self._bandwidth_hz)
         if clock.num_episodes > 1:
-            described = (self._description.wrench, self._description.imu, self._description.pose)
-            files = len({stream.source for stream in described if stream is not None})
+            files = len({stream.source for stream in self._description.streams.values()})
             self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
-from drake_teleop.logs.read.array_files import read_mat
+from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.tables import Table
 
@@ -195,18 +195,6 @@ def array_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
     return parts | arrays
 
 
-def _read_hdf5(path: Path) -> dict[str, NDArray]:
-    from drake_teleop.logs.read.array_files import read_hdf5
-
-    return read_hdf5(path)
-
-
-def _read_zarr(path: Path) -> dict[str, NDArray]:
-    from drake_teleop.logs.read.array_files import read_zarr
-
-    return read_zarr(path)
-
-
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
@@ -241,9 +229,9 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
         ".npz": _reader_of_columns(_read_npz),
         ".npy": _reader_of_columns(_read_npy),
         ".mat": _reader_of_columns(read_mat),
-        ".h5": _reader_of_columns(_read_hdf5),
-        ".hdf5": _reader_of_columns(_read_hdf5),
-        ".zarr": _reader_of_columns(_read_zarr),
+        ".h5": _reader_of_columns(read_hdf5),
+        ".hdf5": _reader_of_columns(read_hdf5),
+        ".zarr": _reader_of_columns(read_zarr),
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""
