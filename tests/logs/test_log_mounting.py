@@ -24,7 +24,13 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_frames
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.read.mounting import (
+    LeverArm,
+    Mounting,
+    find_mounting,
+    lag_of_imu_clock,
+    lever_arm_from_wrench,
+)
 from drake_teleop.logs.read.reading import read_description, read_log
 from drake_teleop.logs.read.tables import Table
 
@@ -441,3 +447,17 @@ def test_ur5_imu_has_the_axes_of_the_tool(ur5: Path) -> None:
     R_SI = np.array(yaml.safe_load(found.split("imu.frame: ")[1]))
     assert np.linalg.norm(rotation_vector_deg(R_SI)) < 1.0
     assert any("the clock of the IMU lags that of the pose by 0.1" in note for note in notes)
+
+
+@pytest.mark.parametrize("lag", [-0.173, 0.0, 0.062])
+def test_best_shift_is_the_lag_for_rotated_axes(lag):
+    rng = np.random.default_rng(2)
+    clock = np.arange(0, 12, 0.005)
+    kernel = np.exp(-0.5 * (np.arange(-40, 41) / 12) ** 2)
+    noise = rng.normal(size=(3, len(clock)))
+    signal = np.array([np.convolve(row, kernel, mode="same") for row in noise]).T
+    t = np.arange(1, 11, 0.01)
+    shown = np.stack([np.interp(t, clock - lag, column) for column in signal.T], axis=1)
+    turned = signal[:, [1, 2, 0]] * [1.0, -1.0, 1.0]
+    found = lag_of_imu_clock(t, [(shown, turned)], clock, 0.5, np.zeros((len(t), 1)))
+    assert found == pytest.approx(lag, abs=2e-3)
