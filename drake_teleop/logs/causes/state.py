@@ -35,9 +35,6 @@ class UsedRows:
     times: tuple[float, ...]
     columns: NDArray[np.intp]
 
-    def has_columns_of(self, model: Model) -> bool:
-        return self.times == model.step_times and np.array_equal(self.columns, model.columns)
-
     @cached_property
     def y(self) -> Array:
         return self.data.select_rows(self.used).append_step_signals(self.times)[:, self.columns]
@@ -220,9 +217,10 @@ class State:
         )
 
     def _rows_for_model(self, model: Model) -> UsedRows:
-        if self.rows.has_columns_of(model):
-            return self.rows
-        return UsedRows(self.data, self.rows.used, model.step_times, model.columns)
+        rows = self.rows
+        if rows.times == model.step_times and np.array_equal(rows.columns, model.columns):
+            return rows
+        return UsedRows(self.data, rows.used, model.step_times, model.columns)
 
     @property
     def model(self) -> Model:
@@ -250,14 +248,9 @@ class State:
         inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
         power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        count = len(self._whole_rows_with_contacts) - len(self.rows.rows_with_predecessors)
+        every = UsedRows(self.data, self.data.used, (), self.model.columns)
+        count = len(every.rows_with_predecessors) - len(self.rows.rows_with_predecessors)
         return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
-
-    @cached_property
-    def _whole_rows_with_contacts(self) -> Array:
-        return np.asarray(
-            UsedRows(self.data, self.data.used, (), self.model.columns).rows_with_predecessors
-        )
 
     @cached_property
     def residual_ratio(self) -> float:
