@@ -9,7 +9,7 @@ import copy
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
-from drake_teleop.common.files import make_folder, whole_file, write_table
+from drake_teleop.common.files import make_folder, whole_file, write_table, write_text
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
@@ -173,7 +173,9 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> No
     if dataset.kind == "zarr":
         _write_zarr(out, columns)
         return
-    for path, part in _columns_by_file(dataset.episodes, columns):
+    for path in dict.fromkeys(episode.file for episode in dataset.episodes):
+        pairs = zip(dataset.episodes, columns, strict=True)
+        part = _join_columns([new for episode, new in pairs if episode.file == path])
         target = out / path.relative_to(dataset.path)
         make_folder(target.parent)
         if path.suffix.lower() == ".parquet":
@@ -182,17 +184,6 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> No
             _write_csv(path, target, part)
     if dataset.kind == "lerobot":
         _write_lerobot_metadata(dataset.path / "meta", out / "meta", columns)
-
-
-def _columns_by_file(
-    episodes: Sequence[Episode], columns: Sequence[NewColumns]
-) -> Iterator[tuple[Path, NewColumns]]:
-    files = list(dict.fromkeys(episode.file for episode in episodes))
-    for file in files:
-        yield (
-            file,
-            _join_columns([c for e, c in zip(episodes, columns, strict=True) if e.file == file]),
-        )
 
 
 def _join_columns(columns: Sequence[NewColumns]) -> NewColumns:
@@ -295,7 +286,7 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
     }
     info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
-    _write_json(target / "info.json", info)
+    write_text(target / "info.json", json.dumps(info, indent=4, ensure_ascii=False))
     if not (source / "stats.json").is_file():
         return
     stats, new = (
@@ -312,9 +303,4 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
         if with_quantiles:
             parts |= {key: np.quantile(x, q, axis=0) for key, q in _LEROBOT_QUANTILES.items()}
         stats[name] = {key: y.tolist() for key, y in parts.items()} | {"count": [len(x)]}
-    _write_json(target / "stats.json", stats)
-
-
-def _write_json(path: Path, data: Any) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_text(target / "stats.json", json.dumps(stats, indent=4, ensure_ascii=False))
