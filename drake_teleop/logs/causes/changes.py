@@ -225,7 +225,12 @@ def find_contact_spans(state: State) -> TimeSpans:
     wide = contact_blocks.copy()
     wide[:-1] |= contact_blocks[1:]
     wide[1:] |= contact_blocks[:-1]
-    return _spans_of_blocks(wide, state.data.t, state.data.rows_per_block)
+    t, rows = state.data.t, state.data.rows_per_block
+    half, last = 0.5 * float(t[1] - t[0]), len(t) - 1
+    return tuple(
+        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
+        for a, b in find_runs_of_true(wide)
+    )
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
@@ -436,12 +441,3 @@ def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
     covariance = state.fit.covariance
     variance = np.diag(covariance[a, a] + covariance[b, b] + 2.0 * covariance[a, b])
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())
-
-
-def _spans_of_blocks(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> TimeSpans:
-    half = 0.5 * float(t[1] - t[0])
-    last = len(t) - 1
-    return tuple(
-        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
-        for a, b in find_runs_of_true(contact_blocks)
-    )

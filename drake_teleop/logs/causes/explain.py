@@ -30,6 +30,7 @@ from drake_teleop.logs.causes.changes import (
 )
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
+    GOOD_SMOOTH_MISFIT,
     gain_covariance,
     jackknife_over_parts,
     load_covariance,
@@ -54,8 +55,6 @@ _COLOURED_NOISE_RATIO = 15.0
 _REDUCED_MISFIT_SHARE = 0.9
 _CERTAIN_SCORE = 1000.0
 _WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
-_GOOD_SMOOTH_MISFIT = 1.35
-"""Largest smooth misfit of good records."""
 _STEP_CAUSES, _MAX_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
@@ -125,9 +124,7 @@ def search_causes(
 
 def may_be_coloured_noise(state: State) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
-    return (
-        state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
-    )
+    return state.smooth_misfit < GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
 
 
 def is_clear_misfit(state: State) -> bool:
@@ -255,7 +252,7 @@ def _best_candidate(found: list[Candidate]) -> Candidate | None:
     return (
         first
         if first.score
-        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / _GOOD_SMOOTH_MISFIT) ** 1.5
+        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
         else None
     )
 

@@ -17,7 +17,8 @@ from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
 _TOLERATED_JACKKNIFE_RATIO, _USUAL_JACKKNIFE_RATIO = 1.5, 1.15
-_GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
+GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
+"""Largest smooth misfit of good records; growth of the deviations above it."""
 _MIN_INCLUDED_SCORE, _FULLY_INCLUDED_SCORE, _FULLY_INCLUDED_RESIDUAL_SHARE = 6.0, 15.0, 0.5
 _CABLE_DEVIATION_FACTOR = 1.5
 _LARGE_RESIDUAL_RATIO = 20.0
@@ -53,7 +54,7 @@ def misfit_deviations(
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
         else _LARGE_SMOOTH_MISFIT
     ):
-        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - _GOOD_SMOOTH_MISFIT))
+        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
     variance = blocks**2 + _variances_of_rejected_causes(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
@@ -141,7 +142,7 @@ def misfit_deviation_factor(state: State, blocks: Array) -> float:
     if "cable" in state.model.extensions:
         factor *= _CABLE_DEVIATION_FACTOR  # a spring models a cable only to first order
     return factor * (
-        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - _GOOD_SMOOTH_MISFIT)
+        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - GOOD_SMOOTH_MISFIT)
     )
 
 
