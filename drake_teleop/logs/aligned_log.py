@@ -150,7 +150,7 @@ def read_aligned_log(
     `delay` [s] or "auto" is removed; `usual_s` [s] is used if the record does not determine it.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
-    weight_removed = weight_removed or "weight" in log.free
+    weight_removed = weight_removed or "weight" in log.estimated
     smooth = None
     coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
     with one_blas_thread():

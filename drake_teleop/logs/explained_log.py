@@ -237,7 +237,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain_misfit(data, instants_at_delay, log.free)
+    why = explain_misfit(data, instants_at_delay, log.estimated)
     if log.described is None:
         return why
     causes = add_description_lines(why.causes, log, by_pose=found is not None)
@@ -291,7 +291,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identification:
-    if not why.causes and not why.given:
+    if not why.causes and not why.always_fitted:
         if why.explained or not load.identifiable.any():
             return load
         stated = np.sqrt(np.diag(load.covariance))
@@ -306,7 +306,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
     identifiable = is_precise_enough(deviations, why.theta[6:])
     if why.causes and why.causes[0].name == "no load":
         identifiable = np.repeat([True, False], [6, 10])
-    if why.several_gains:
+    if why.has_several_gains:
         identifiable = np.zeros(16, bool)
     return replace(
         load,
@@ -316,7 +316,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         identifiable=identifiable,
         residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
-        or "weight" in why.given,
+        or "weight" in why.always_fitted,
         prior_dominated=np.zeros(16, bool),
         degrees_of_freedom=np.full(16, np.inf),
         method="generalised least squares with named causes",
@@ -325,7 +325,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
 
 def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
-    if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
+    if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)
     return why.causes
@@ -342,7 +342,7 @@ def unexplained_finding(why: Explanation) -> Finding:
 
 
 def removed_weight_note(why: Explanation) -> str:
-    if "weight" not in why.given or why.removed_weight is None:
+    if "weight" not in why.always_fitted or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
     deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))

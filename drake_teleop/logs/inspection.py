@@ -18,10 +18,10 @@ from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
-from drake_teleop.logs.read.alignment import white_noise
-from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream
+from drake_teleop.logs.read.alignment import white_noise_deviations
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream_table
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import min_gap_length, time_stamps_s
+from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_episodes
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -143,12 +143,9 @@ def _inspect_described_log(
 ) -> list[Finding]:
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
-    for name in ("wrench", "imu", "pose", "static"):
-        stream = getattr(description, name)
-        if stream is None:
-            continue
+    for name, stream in description.streams.items():
         if stream.source not in tables:
-            tables[stream.source] = read_stream(stream)
+            tables[stream.source] = read_stream_table(stream)
         table = tables[stream.source].rows_with_numbers(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
@@ -184,7 +181,7 @@ def _inspect_stream(
         for field in _QUANTITY_NAMES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
-    values = table.raw_side_by_side(columns, f"{source}:{name}")
+    values = table.numbers_with_nan_side_by_side(columns, f"{source}:{name}")
     good = np.asarray(np.isfinite(values).all(axis=1))
     findings: list[Finding] = []
     figures: dict[str, Any] = {"rows": len(values)}
@@ -217,7 +214,7 @@ def _inspect_stream(
             "min": float(finite.min()),
             "max": float(finite.max()),
             "mean": float(finite.mean()),
-            "noise": float(white_noise(finite[:, None])[0]),
+            "noise": float(white_noise_deviations(finite[:, None])[0]),
             "saturated": saturated,
         }
         if saturated:
@@ -227,7 +224,7 @@ def _inspect_stream(
             )
             findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
-    return figures, findings, rows if table.kept is None else table.kept[rows]
+    return figures, findings, rows if table.kept_rows is None else table.kept_rows[rows]
 
 
 def _repeated_rows_findings(
@@ -260,7 +257,7 @@ def _inspect_clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
-    stamps, figures["episodes"] = time_stamps_s(time, table, at)
+    stamps, figures["episodes"] = time_stamps_and_episodes(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)
     usable[1:] &= stamps[1:] > highest[:-1]
@@ -273,7 +270,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length(median, GAP_BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length_s(median, GAP_BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
@@ -306,7 +303,7 @@ def _inspect_clock(
 def _channel_labels(columns: Sequence[str], table: Table) -> list[str]:
     labels: list[str] = []
     for column in columns:
-        width = table.raw(column, column).shape[1]
+        width = table.numbers_with_nan(column, column).shape[1]
         labels += [column] if width == 1 else [f"{column}[{i}]" for i in range(width)]
     return labels
 
@@ -324,7 +321,7 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
 
 
 def _remove_nonfinite_rows(table: Table) -> Table:
-    columns = [table.raw(name, name) for name in table.columns]
+    columns = [table.numbers_with_nan(name, name) for name in table.columns]
     if len({len(x) for x in columns}) != 1:
         return table
     return _remove_rows(table, np.flatnonzero(~np.isfinite(np.hstack(columns)).all(axis=1)))

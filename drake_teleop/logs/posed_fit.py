@@ -19,7 +19,7 @@ from drake_teleop.logs.aligned_log import (
     use_spline_motion,
 )
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
+from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
 from drake_teleop.logs.explained_log import note_for_table
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
@@ -63,7 +63,7 @@ def fit_load_to_posed_log(
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
     found, source = estimate_motion_and_load(log, delay)
-    finding = None if log.free else pose_finding(found, log)
+    finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
         if not found.is_imu_consistent or (finding is not None and not rotated):

@@ -28,15 +28,15 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import read_aligned_log
 from drake_teleop.logs.causal import CausalWrench, compute_causal_wrench
-from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
+from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
     check_file,
     check_suspicious_load,
-    findings_about_motion,
+    motion_findings,
 )
-from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
+from drake_teleop.logs.check.corrections import FINDINGS_CAUSED_BY_MISFIT, Finding
 from drake_teleop.logs.contact import (
     MIN_NOISE_FLOOR_SAMPLES,
     Detection,
@@ -227,7 +227,7 @@ def _read_and_identify_log(
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
-        errors = findings_about_motion(check)
+        errors = motion_findings(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -235,8 +235,8 @@ def _read_and_identify_log(
     if why is not None:
         result = explained_load(result, why)
         causes = replace_frame_causes(why, other[0]) if other else why.causes
-    note = fit.note if not causes or (why is not None and why.several_gains) else ""
-    if raw.free and why is not None:
+    note = fit.note if not causes or (why is not None and why.has_several_gains) else ""
+    if raw.estimated and why is not None:
         note = removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
@@ -244,7 +244,7 @@ def _read_and_identify_log(
     findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
     if errors:
         findings = errors
-    elif not causes and not raw.free:
+    elif not causes and not raw.estimated:
         findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
@@ -291,9 +291,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
-    if identified.causes and all(
-        finding.name in POSSIBLE_EFFECTS_OF_CAUSES for finding in findings
-    ):
+    if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
         )
@@ -468,7 +466,7 @@ def _read_and_eliminate_log(
     offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
-    removed = identification.weight_removed or "weight" in log.free
+    removed = identification.weight_removed or "weight" in log.estimated
     _require_gravity_for_scales(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
@@ -564,7 +562,7 @@ def _find_suspected_errors(
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()
-    ignored = {"lag", "payload", *TEMPORARY_CAUSES}
+    ignored = {"lag", "payload", *CAUSES_WITHOUT_CORRECTION}
     if load.weight_removed:
         ignored |= {"weight removed", "payload configured"}
     return tuple(x for x in check_log(path).findings if x.name not in ignored)

@@ -20,7 +20,7 @@ from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW_OVER_PERIOD,
-    smoother_weights,
+    polynomial_fit_weights,
     vectors_of_skew_parts,
 )
 from drake_teleop.robots.compensator import (
@@ -248,7 +248,7 @@ class MotionWindow:
         self._steps.append(step)
         if len(self._steps) == _PERIOD_MEDIAN_SAMPLES:
             self._dt = float(np.median(self._steps))
-            self._weights = smoother_weights(10**9, self._dt, self._cutoff_hz)[:3]
+            self._weights = polynomial_fit_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
             self.reset()
 

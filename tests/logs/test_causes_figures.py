@@ -14,10 +14,10 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
 from drake_teleop.logs.causes.cause import causes_of_fit, loads_between_changes
 from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
-from drake_teleop.logs.causes.explain import _remove_delay
+from drake_teleop.logs.causes.explain import _apply_fitted_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, StepChange
-from drake_teleop.logs.causes.state import State, likelihood_gain
+from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
+from drake_teleop.logs.causes.state import State, first_order_gain
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -45,7 +45,8 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
          {"position_in_sensor": [-0.01, 0.02, -0.03]}, "[-10, 20, -30] mm in S (+- 8.8 mm)"),
         (Model(("rotation",)), [0.0, 0.3, -0.4], "sensor rotation",
          {"rotation_vector": [0.0, 0.3, -0.4]}, "rotated by 28.65 deg (+- 0.5) against"),
-        (Model(gains=(4,)), [0.2], "gain", {"gain": 1.2}, "tau_y reads 20.00 % (+- 0.83) more"),
+        (Model(gain_channels=(4,)), [0.2], "gain",
+         {"gain": 1.2}, "tau_y reads 20.00 % (+- 0.83) more"),
         (Model(("linear drift",)), [1.0, -2.0, 0.5, 0.1, 0.3, -0.2], "drift",
          {"range": [2.0, 4.0, 1.0, 0.2, 0.6, 0.4]}, "4 N and 0.6 N m"),
         (Model(("drift",)), [*np.zeros(15), 0.1, -0.2, 0.3], "drift",
@@ -66,8 +67,8 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
     for key, value in figures.items():
         found = cause.values[key]
         assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
-    given = causes_of_fit(state_of(model, values), given=model.parts)
-    assert bool(given) != bool(model.parts)
+    given = causes_of_fit(state_of(model, values), always_fitted=model.extensions)
+    assert bool(given) != bool(model.extensions)
 
 
 @pytest.mark.parametrize(
@@ -120,11 +121,11 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
         return block_means_of_record(T, wrench, moving(T + delay - before - late), GRAVITY_W)
 
     state = State.fit_record(with_delay(before), Model())
-    assert state.x[DELAY_PARAMETER] == pytest.approx(late, abs=1e-3)
-    after, delay = _remove_delay(state, before, with_delay)
+    assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
+    after, delay = _apply_fitted_delay(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
-    assert (abs(after.x[DELAY_PARAMETER]) < 5e-4) == moves
-    assert _remove_delay(state, before, None) == (state, before)
+    assert (abs(after.x[DELAY_INDEX]) < 5e-4) == moves
+    assert _apply_fitted_delay(state, before, None) == (state, before)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e2])
@@ -132,10 +133,10 @@ def test_gain_of_smooth_signals_counts_independent_ones(scale):
     rng = np.random.default_rng(0)
     A, e = rng.normal(size=(30, 4)) * [1.0, scale, 1e-3, 2.0], rng.normal(size=30)
     for columns, rank in ((A, 4), (np.column_stack([A, A[:, 0] + A[:, 3], 0.0 * e]), 4)):
-        gain, found = likelihood_gain(columns.T @ columns, columns.T @ e)
+        gain, found = first_order_gain(columns.T @ columns, columns.T @ e)
         fitted = A @ np.linalg.lstsq(A, e, rcond=None)[0]
         assert found == rank and gain == pytest.approx(fitted @ fitted, rel=1e-5)
-    some = likelihood_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
+    some = first_order_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
     assert some[1] == 3 and some[0] < gain
 
 
@@ -182,7 +183,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
-    monkeypatch.setattr("drake_teleop.logs.causes.candidates._SMALLEST_GAIN", 1.0)
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_GAIN_ERROR", 1.0)
     (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
     gain = 2.0 * (contact.state.likelihood - state.likelihood)

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.instants import (
-    FORCES,
+    WRENCH,
     Instants,
     block_means_of_record,
     delay_of_free_fit,
 )
-from drake_teleop.logs.causes.intervals import misfit_factor
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, StepChange
+from drake_teleop.logs.causes.intervals import misfit_deviation_factor
+from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
 from drake_teleop.logs.causes.state import UsedRows, fit_model, is_in_spans, regularized_inverse
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
@@ -85,7 +85,7 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     y = data.append_step_signals(())
     np.testing.assert_allclose(
-        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, FORCES].T, atol=1e-9
+        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, WRENCH].T, atol=1e-9
     )
     left = model.residual_coefficients(x) @ y[:, model.columns].T
     np.testing.assert_allclose(left, 0.0, atol=1e-9)
@@ -93,10 +93,10 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     change = model.residual_coefficients(x + move) - model.residual_coefficients(x - move)
     expected = -2.0 * np.tensordot(move, model.wrench_derivative(x), 1)
     np.testing.assert_allclose(change, expected, atol=1e-9)
-    assert model.start_parameters(x, Model())[: DELAY_PARAMETER + 1] == pytest.approx(
-        x[: DELAY_PARAMETER + 1]
+    assert model.start_parameters(x, Model())[: DELAY_INDEX + 1] == pytest.approx(
+        x[: DELAY_INDEX + 1]
     )
-    assert not model.start_parameters(x, Model())[DELAY_PARAMETER + 1 :].any()
+    assert not model.start_parameters(x, Model())[DELAY_INDEX + 1 :].any()
     other = model.with_extension("torque factor")
     np.testing.assert_array_equal(other.start_parameters(x, model)[other.slices[name]], values)
 
@@ -105,7 +105,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     """A step in the middle of a block has half its effect there."""
     load, offsets = np.arange(10.0) * 0.1, np.arange(1.0, 7.0)
     steps = StepChange("load", 102.0), StepChange("offsets", 103.01)
-    model = Model(steps=steps, axes=SWAPPED, factor=10.0)
+    model = Model(steps=steps, axes=SWAPPED, torque_factor=10.0)
     x = np.concatenate([OFFSETS, PHI, [0.02], load, offsets])
     s, omega, alpha, *_ = moving(T)
     before, more = (non_contact_wrench(s, omega, alpha, phi) for phi in (PHI, load))
@@ -115,7 +115,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     rng = np.random.default_rng(0)
     data = record(rng.normal(size=(len(T), 6)))
     found = data.append_step_signals(model.step_times) @ model.wrench_coefficients(x[None])[0].T
-    rates = np.gradient(data.y[:, FORCES], 0.02, axis=0)
+    rates = np.gradient(data.y[:, WRENCH], 0.02, axis=0)
     inside = slice(2, -2)
     np.testing.assert_allclose(found[inside], (expected + 0.02 * rates)[inside], atol=1e-9)
 
@@ -168,7 +168,7 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
     error = found.x - np.concatenate([OFFSETS, PHI, [0.0], values])
     deviations = np.sqrt(np.diag(found.covariance))
     assert np.abs(error / deviations).max() < 4.0
-    assert np.linalg.norm(error[DELAY_PARAMETER + 1 :]) < 0.05 * np.linalg.norm(values)
+    assert np.linalg.norm(error[DELAY_INDEX + 1 :]) < 0.05 * np.linalg.norm(values)
     np.testing.assert_allclose(found.filters[:, 1], -0.7, atol=0.25)
     np.testing.assert_allclose(np.sqrt(found.power) / white, 1.0, atol=0.25)
 
@@ -202,11 +202,13 @@ def test_instants_are_block_means(size):
     np.testing.assert_array_equal(np.flatnonzero(~data.used), [0, 50, 119, 199])
     np.testing.assert_allclose(data.t, t.reshape(200, size).mean(axis=1))
     means = noise.reshape(200, size, 6).mean(axis=1)
-    np.testing.assert_allclose(data.y[data.used][:, FORCES], means[data.used])
-    np.testing.assert_allclose(data.white * np.sqrt(size), np.repeat([0.4, 0.03], 3), rtol=0.25)
+    np.testing.assert_allclose(data.y[data.used][:, WRENCH], means[data.used])
+    np.testing.assert_allclose(
+        data.wrench_noise * np.sqrt(size), np.repeat([0.4, 0.03], 3), rtol=0.25
+    )
     called = block_means_of_record(t, noise, moving, GRAVITY_W, lost)
     np.testing.assert_allclose(called.y, data.y, atol=2e-3 * np.abs(data.y).max())
-    assert data.dt == pytest.approx(0.02) and data.positions
+    assert data.dt == pytest.approx(0.02) and data.has_positions
 
 
 def test_rows_within_spans_are_marked():
@@ -230,8 +232,8 @@ def test_deviations_widen_with_the_scatter_of_parts_and_with_a_smooth_misfit(
 ):
     state = SimpleNamespace(
         fit=SimpleNamespace(covariance=1e-12 * np.eye(40)),
-        model=SimpleNamespace(parts=parts),
+        model=SimpleNamespace(extensions=parts),
         smooth_misfit=smooth,
         x=np.concatenate([OFFSETS, PHI]),
     )
-    assert misfit_factor(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)
+    assert misfit_deviation_factor(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)

@@ -20,7 +20,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
 from drake_teleop.logs.dataset.dataset_files import open_dataset
-from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     find_hypothesis,
@@ -51,7 +51,7 @@ def verdict(x: SampleEpisode) -> set[str]:
     signals = EpisodeSignals(log_of(x))
     predict = signals.reading_predictor(TRUE_PHI)
     found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * WRENCH_NOISE_STD)
-    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturated_channels(x.wrench)}
+    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(
         unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
     )
@@ -134,7 +134,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     found = find_hypothesis(
         signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * WRENCH_NOISE_STD
     )
-    assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
+    assert np.degrees(Rotation.from_matrix(found.force_axes @ R.T).magnitude()) < 3.0
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -209,7 +209,9 @@ def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
         episodes = write_sample_dataset(tmp_path / "demo", episodes=2, seed=seed)
         dataset = open_dataset(tmp_path / "demo")
         for episode, made in zip(dataset.episodes, episodes, strict=True):
-            read = dataset.read_episode(episode).raw("observation.wrench[2]", "test")[:, 0]
+            read = dataset.read_episode(episode).numbers_with_nan("observation.wrench[2]", "test")[
+                :, 0
+            ]
             np.testing.assert_allclose(read, made.wrench[:, 2], atol=1e-5)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from test_dataset import log_of
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     Hypothesis,
@@ -36,10 +36,10 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"lag": -1.0}, ["3.0 frames (0.150 s) ahead of the wrench"]),
         ({"kind": "base"}, ["the axes of the base"]),
         ({"kind": "weight removed"}, ["already removed the load's weight"]),
-        ({"force": -I3, "torque": -I3}, ["the wrench is negated"]),
-        ({"force": FLIP, "torque": FLIP}, ["axis y of the wrench is reversed"]),
-        ({"torque": SKEW}, ["the torque is turned by 30 deg about [0, 1, 0]"]),
-        ({"force": -SKEW}, ["the force is negated", "the force is turned by 30 deg"]),
+        ({"force_axes": -I3, "torque_axes": -I3}, ["the wrench is negated"]),
+        ({"force_axes": FLIP, "torque_axes": FLIP}, ["axis y of the wrench is reversed"]),
+        ({"torque_axes": SKEW}, ["the torque is turned by 30 deg about [0, 1, 0]"]),
+        ({"force_axes": -SKEW}, ["the force is negated", "the force is turned by 30 deg"]),
         ({"gain": np.array([1.05, 0.95])}, []),
         ({"gain": np.array([0.1, 1.0])}, ["the force is 0.1 times that in N: its unit is daN"]),
         ({"gain": np.array([1.0, 8.85])}, ["torque is 8.85 times that in N m: its unit is lbf in"]),
@@ -62,10 +62,10 @@ def test_findings_contain_figures_and_units(change, expected):
         ({}, 0.0),
         ({"lag": 2.125}, 1.0),
         ({"kind": "base"}, 1.0),
-        ({"force": -I3, "torque": -I3}, 1.0),
-        ({"force": QUARTER, "torque": QUARTER}, 1.5),
-        ({"force": SKEW, "torque": SKEW}, 2.5),
-        ({"torque": FLIP}, 1.0),
+        ({"force_axes": -I3, "torque_axes": -I3}, 1.0),
+        ({"force_axes": QUARTER, "torque_axes": QUARTER}, 1.5),
+        ({"force_axes": SKEW, "torque_axes": SKEW}, 2.5),
+        ({"torque_axes": FLIP}, 1.0),
         ({"gain": np.array([2.0, 1.0])}, 1.0),
         ({"gain": np.array([1.0, 3.0])}, 1.0),
         ({"gain": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
@@ -122,14 +122,14 @@ def test_step_of_the_offsets_is_found_inside_the_episode(step, at, found, channe
 def test_frames_at_an_end_of_the_range_are_counted(rows, saturated, side):
     wrench = np.random.default_rng(2).normal(size=(100, 6))
     wrench[20 : 20 + rows, 4] = 9.0 * side
-    found = saturated_channels(wrench)
+    found = saturation_faults(wrench)
     assert [f.message for f in found] == (
         [f"channels stay at the end of their range: tau_y for {rows} frames"] if saturated else []
     )
     wrench[50 : 50 + rows, 4] = 0.5  # a coarse step that lasts as long
-    assert saturated_channels(wrench) == []
+    assert saturation_faults(wrench) == []
     wrench[:, 1] = 2.0
-    assert saturated_channels(wrench)[0].name == "dead channel"
+    assert saturation_faults(wrench)[0].name == "dead channel"
 
 
 @pytest.mark.parametrize("lag", [0.0, 2.5, -3.0, 0.37])

@@ -13,8 +13,10 @@ from drake_teleop.logs.read.alignment import (
     resample,
     smooth_derivatives,
     uniform_times,
+    white_noise_deviations,
 )
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.streams import Stream, resample_to_clock
 
 
 def make_log(t: np.ndarray) -> Log:
@@ -111,3 +113,25 @@ def test_resample_interpolates_matrices() -> None:
     x = np.arange(12.0).reshape(3, 2, 2)
     found = resample(np.array([0.5, 1.0]), np.arange(3.0), x)
     np.testing.assert_allclose(found, [x[:2].mean(axis=0), x[1]])
+
+
+@pytest.mark.parametrize("ratio", [1.5, 4.0])
+def test_resampling_to_a_slower_clock_does_not_alias(ratio):
+    """A tone above half the clock's rate, in streams slightly and much faster than it."""
+    t, rate = np.arange(0, 4, 0.01), 100.0 * ratio
+    fast = np.arange(0, 4, 1 / rate)
+    tone, slow = np.sin(2 * np.pi * 61.0 * fast), np.sin(2 * np.pi * 3.0 * fast)
+    stream = Stream("wrench", fast)
+    seen = resample_to_clock(t, stream, np.stack([tone, slow], axis=1))[50:-50]
+    # Second-order Butterworth at 0.4 of the rate, forward and backward.
+    assert np.abs(seen[:, 0]).max() < 1.02 / (1 + (61 / 40) ** 4)
+    np.testing.assert_allclose(seen[:, 1], np.sin(2 * np.pi * 3.0 * t)[50:-50], atol=0.01)
+
+
+def test_white_noise_is_seen_under_a_smooth_motion() -> None:
+    rng, sigma = np.random.default_rng(4), np.array([0.02, 0.3, 1.5])
+    t = np.arange(0, 20, 1e-3)[:, None]
+    motion = 20 * np.sin(2 * np.pi * np.array([0.5, 1.0, 2.0]) * t)
+    found = white_noise_deviations(motion + sigma * rng.normal(size=(len(t), 3)))
+    np.testing.assert_allclose(found, sigma, rtol=0.05)
+    assert not white_noise_deviations(motion[:3]).any()

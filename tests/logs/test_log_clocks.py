@@ -46,7 +46,7 @@ def test_valid_stamps_are_unchanged() -> None:
     t = 1.7e9 + np.arange(50) * 0.01
     clock = clock_of(t, offset=0.5)
     np.testing.assert_array_equal(clock.t, t + 0.5)
-    np.testing.assert_array_equal(clock.rows, np.arange(50))
+    np.testing.assert_array_equal(clock.kept_rows, np.arange(50))
     assert clock.notes == () and not len(find_gaps_in_times(clock.t, 30.0))
     scaled = clock_of(t, scale=1.001, offset=0.5).t
     np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
@@ -58,16 +58,16 @@ def test_rate_of_5_hz_is_accepted() -> None:
 
 def test_rows_without_a_stamp_are_removed() -> None:
     clock = clock_of([0.0, 0.1, NAN, NAN, 0.4, 0.5])
-    assert clock.rows.tolist() == [0, 1, 4, 5] and clock.total == 6
+    assert clock.kept_rows.tolist() == [0, 1, 4, 5] and clock.num_rows == 6
     assert clock.notes == ("2 rows without a time stamp are removed",)
 
 
 def test_repeated_rows_are_removed() -> None:
     clock = clock_of([0.0, 0.1, 0.1, 0.1, 0.2, 0.3], [1, 2, 2, 2, NAN, 5])
-    assert clock.rows.tolist() == [0, 1, 4, 5]
+    assert clock.kept_rows.tolist() == [0, 1, 4, 5]
     assert "2 rows that repeat the previous row" in clock.notes[0]
     blank = clock_of([0.0, 0.1, 0.1, 0.2], [1, NAN, NAN, 2])
-    assert blank.rows.tolist() == [0, 1, 3]
+    assert blank.kept_rows.tolist() == [0, 1, 3]
 
 
 @pytest.mark.parametrize(

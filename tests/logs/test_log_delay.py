@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from known_motion import motion_at
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.against_load import LoadFit, fit_load
 from drake_teleop.logs.read.alignment import estimate_delay
 from drake_teleop.logs.read.canonical import Log
 
@@ -60,3 +62,28 @@ def test_delay_outside_the_search_range_is_none() -> None:
         0.08, abs=1e-5
     )
     assert estimate_delay(delayed_log(0.12, 0.0, duration=1.0), 30.0, PHI) is None
+
+
+@pytest.mark.parametrize("start", [0.0, 1000.0])
+def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float) -> None:
+    t = start + np.arange(0, 4, 2e-3)
+    motion = motion_at(t - start)
+    wrench = non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
+    log = Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
+    fit = fit_load(log)
+    assert fit.independent == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
+    assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
+
+
+def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
+    s = 9.81 * Rotation.random(30, random_state=2).apply([0.0, 0.0, 1.0])
+    rest = np.zeros((30, 3))
+    wrench = non_contact_wrench(s, rest, rest, PHI) + 3.0
+    fit = fit_load(Log(np.arange(30.0), wrench, s, rest, rest, static=True))
+    assert fit.mass == pytest.approx(PHI[0], rel=1e-6) and fit.is_good
+    assert fit.independent == 30 - 8
+
+
+def test_a_good_fit_explains_most_and_has_a_mass() -> None:
+    assert LoadFit(0.001, 1.0).is_good
+    assert not LoadFit(0.9, 1.0).is_good and not LoadFit(0.001, -1.0).is_good

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -7,10 +8,11 @@ import pytest
 import yaml
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.read.description import Description, load_description
+from drake_teleop.logs.read.description import Description, json_schema, load_description
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = DOCS / "log-description.md"
+SCHEMA = DOCS / "log-description.schema.json"
 EXAMPLES = [
     example
     for page in (PAGE, DOCS / "logs.md")
@@ -127,3 +129,16 @@ def _expect_error(folder: Path, text: str, words: list[str]) -> None:
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+def test_shipped_schema_matches_the_code() -> None:
+    assert json.loads(SCHEMA.read_text(encoding="utf-8")) == json.loads(json_schema())
+
+
+def test_schema_contains_every_field_and_all_forms_of_gravity() -> None:
+    schema = json.loads(json_schema())
+    assert set(schema["properties"]) == set(Description.model_fields)
+    assert schema["additionalProperties"] is False
+    kinds = [form["type"] for form in schema["properties"]["gravity"]["anyOf"]]
+    assert kinds == ["number", "array", "string"]
+    assert "inverse" in schema["$defs"]["Orientation"]["properties"]

@@ -293,7 +293,7 @@ def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) ->
     assert "# Columns without a guess: 1, 2, 3, 4." in text
     wrench = yaml.safe_load(text)["wrench"]
     assert wrench["header"] is False and wrench["time"] == {"column": "0", "unit": "s"}
-    assert len(read_table(tmp_path / "x.csv", header=False).raw(0, "here")) == 60
+    assert len(read_table(tmp_path / "x.csv", header=False).numbers_with_nan(0, "here")) == 60
 
 
 def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:

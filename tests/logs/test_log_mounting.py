@@ -24,7 +24,13 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_frames
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.read.mounting import (
+    LeverArm,
+    Mounting,
+    find_mounting,
+    lag_of_imu_clock,
+    lever_arm_from_wrench,
+)
 from drake_teleop.logs.read.reading import read_description, read_log
 from drake_teleop.logs.read.tables import Table
 
@@ -205,10 +211,10 @@ def test_wrench_is_used_if_it_determines_more_coordinates_than_the_pose(
     monkeypatch.setattr(auto_frames, "lever_arm_from_wrench", lambda _: other)
     of_the_pose: Any = SimpleNamespace(fits_pose=True, lever=of_pose)
     if taken == "wrench":
-        assert auto_frames._choose_lever_arm(of_the_pose, None, "here") is other
+        assert auto_frames._lever_arm_from_pose_or_wrench(of_the_pose, None, "here") is other
         return
     with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
-        auto_frames._choose_lever_arm(of_the_pose, None, "here")
+        auto_frames._lever_arm_from_pose_or_wrench(of_the_pose, None, "here")
 
 
 def test_contact_prevents_a_lever_arm_from_the_wrench() -> None:
@@ -351,7 +357,7 @@ def test_mirrored_axes_are_found_despite_a_lag() -> None:
     tables = recorder.tables()
     columns = tables[Path("i")].columns
     columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
-    assert mounting(recorder, tables).mirrored
+    assert mounting(recorder, tables).is_mirrored
 
 
 def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:
@@ -441,3 +447,17 @@ def test_ur5_imu_has_the_axes_of_the_tool(ur5: Path) -> None:
     R_SI = np.array(yaml.safe_load(found.split("imu.frame: ")[1]))
     assert np.linalg.norm(rotation_vector_deg(R_SI)) < 1.0
     assert any("the clock of the IMU lags that of the pose by 0.1" in note for note in notes)
+
+
+@pytest.mark.parametrize("lag", [-0.173, 0.0, 0.062])
+def test_best_shift_is_the_lag_for_rotated_axes(lag):
+    rng = np.random.default_rng(2)
+    clock = np.arange(0, 12, 0.005)
+    kernel = np.exp(-0.5 * (np.arange(-40, 41) / 12) ** 2)
+    noise = rng.normal(size=(3, len(clock)))
+    signal = np.array([np.convolve(row, kernel, mode="same") for row in noise]).T
+    t = np.arange(1, 11, 0.01)
+    shown = np.stack([np.interp(t, clock - lag, column) for column in signal.T], axis=1)
+    turned = signal[:, [1, 2, 0]] * [1.0, -1.0, 1.0]
+    found = lag_of_imu_clock(t, [(shown, turned)], clock, 0.5, np.zeros((len(t), 1)))
+    assert found == pytest.approx(lag, abs=2e-3)

@@ -14,7 +14,7 @@ from posed_record import GRAVITY_W, LATE, PHI, SHIFT, TURN, Kind, record
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.logs.check.pose_checks import frame_finding
+from drake_teleop.logs.check.pose_checks import pose_frame_finding
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.poses import PosesOfLog
@@ -130,8 +130,8 @@ def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
 
 LIMITS = {
     "read.table_files._MAX_CELLS_IN_MEMORY": 100,
-    "read.reading._CHUNK_ROWS": 300,
-    "read.alignment._CHUNK_ROWS": 170,
+    "read.reading._CONVERTED_CHUNK_ROWS": 300,
+    "read.alignment._INTERPOLATED_CHUNK_ROWS": 170,
     "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._MIN_KEPT_SAMPLES": 300,
     "posed_fit._CHUNK_SAMPLES": 70,
@@ -245,7 +245,7 @@ def test_wrong_torque_unit_is_not_reported_as_a_shift(unit):
     wrench = wrench * np.repeat([1.0, unit], 3)
     posed = PosesOfLog(poses, GRAVITY_W)
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W)
-    assert frame_finding(found, posed) is None
+    assert pose_frame_finding(found, posed) is None
 
 
 @pytest.mark.parametrize("inverse", [False, True])

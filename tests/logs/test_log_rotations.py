@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import NUM_COLUMNS_OF_FORM, rotation_matrices
-from drake_teleop.logs.read.mounting import solve_least_squares
+from drake_teleop.logs.read.mounting import nonlinear_least_squares
 from drake_teleop.logs.read.streams import OrientationColumns
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
@@ -31,13 +31,13 @@ def test_all_rotation_forms_give_the_same_matrix(form: str) -> None:
 
 def test_solve_handles_a_zero_residual() -> None:
     exact = np.array([0.3, -2.0])
-    x, deviations = solve_least_squares(
+    x, deviations = nonlinear_least_squares(
         lambda x: np.outer(np.arange(60.0), [1, 1, 1]) * (x - exact).sum(), exact
     )
     np.testing.assert_array_equal(x, exact)
     assert np.isinf(deviations).all()  # only the sum is determined
     noise = np.random.default_rng(3).normal(size=(200, 3))
-    x, _ = solve_least_squares(
+    x, _ = nonlinear_least_squares(
         lambda x: np.hstack([x[:1] - noise, np.full((200, 3), x[1])]), np.ones(2)
     )
     np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # one half has a zero residual
@@ -51,10 +51,10 @@ def test_solve_uses_given_linear_derivatives() -> None:
         calls.append(x)
         return np.sin(maps[:, :, :2] @ x[:2]) + maps[:, :, 2:] @ x[2:] - readings
 
-    found = solve_least_squares(residual, np.zeros(5))
+    found = nonlinear_least_squares(residual, np.zeros(5))
     differenced = len(calls)
     np.testing.assert_allclose(
-        solve_least_squares(residual, np.zeros(5), maps[:, :, 2:]), found, rtol=1e-5
+        nonlinear_least_squares(residual, np.zeros(5), maps[:, :, 2:]), found, rtol=1e-5
     )
     assert len(calls) - differenced < 0.7 * differenced
 
@@ -71,9 +71,9 @@ def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: b
         "euler": turns.as_euler("ZYX", degrees=True),
     }[form]
     orientations = OrientationColumns(
-        SimpleNamespace(si_value=lambda unit: np.radians(1.0)),
+        SimpleNamespace(unit_in_si=lambda unit: np.radians(1.0)),
         SimpleNamespace(columns=[], form=form, axes="ZYX", unit="deg", inverse=inverse),
-        SimpleNamespace(numbers=lambda *_: columns.copy()),
+        SimpleNamespace(finite_numbers=lambda *_: columns.copy()),
         5,
         "log.yaml:pose.orientation",
     )

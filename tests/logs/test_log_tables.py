@@ -17,7 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import read_table
-from drake_teleop.logs.read.tables import decimal_step
+from drake_teleop.logs.read.tables import decimal_resolution
 
 
 def write(path: Path, text: str) -> Path:
@@ -30,22 +30,22 @@ def test_csv_and_parquet_give_the_same_table(tmp_path: Path) -> None:
     frame.write_csv(tmp_path / "x.csv")
     frame.write_parquet(tmp_path / "x.parquet")
     for name in ("x.csv", "x.parquet"):
-        found = read_table(tmp_path / name).numbers(["b", "a"], 2, "here")
+        found = read_table(tmp_path / name).finite_numbers(["b", "a"], 2, "here")
         assert found.tolist() == [[3.0, 1.0], [4.0, 2.5]]
 
 
 def test_npz_array_counts_as_several_columns(tmp_path: Path) -> None:
     matrices = np.arange(18.0).reshape(2, 3, 3)
     np.savez(tmp_path / "x.npz", R=matrices, t=np.arange(2.0))
-    found = read_table(tmp_path / "x.npz").numbers(["R"], 9, "here")
+    found = read_table(tmp_path / "x.npz").finite_numbers(["R"], 9, "here")
     assert found.tolist() == matrices.reshape(2, 9).tolist()
-    parts = read_table(tmp_path / "x.npz").numbers(["R[5]", "R[0]"], 2, "here")
+    parts = read_table(tmp_path / "x.npz").finite_numbers(["R[5]", "R[0]"], 2, "here")
     assert parts.tolist() == [[5.0, 0.0], [14.0, 9.0]]
 
 
 def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
-    assert table.numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]
+    assert table.finite_numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_errors_name_file_and_remedy(
 ) -> None:
     path = write(tmp_path / name, text)
     with pytest.raises(DrakeTeleopError) as error:
-        read_table(path).numbers(columns, 1, "here")
+        read_table(path).finite_numbers(columns, 1, "here")
     for word in [*words, ";"]:
         assert word in str(error.value)
 
@@ -96,7 +96,7 @@ def test_error_names_the_row_of_a_cell_without_a_number(
     cells[row] = cell
     table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
     with pytest.raises(DrakeTeleopError, match=rf"'{cell}' in row {row + 2} is not a number"):
-        table.raw("a", "here")
+        table.numbers_with_nan("a", "here")
 
 
 def test_missing_file_raises_error(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_missing_file_raises_error(tmp_path: Path) -> None:
 def test_columns_of_different_length_raise_error(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", a=np.zeros(3), b=np.zeros(4))
     with pytest.raises(DrakeTeleopError, match=r"'b' of x\.npz has 4 rows where 3 are needed"):
-        read_table(tmp_path / "x.npz").numbers(["a", "b"], 2, "here")
+        read_table(tmp_path / "x.npz").finite_numbers(["a", "b"], 2, "here")
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_text_of_other_programs_is_read(
 ) -> None:
     path = tmp_path / f"x.{suffix}"
     path.write_bytes(text.encode(encoding))
-    found = read_table(path).numbers(["t", "f"], 2, "here")
+    found = read_table(path).finite_numbers(["t", "f"], 2, "here")
     assert found.tolist() == [[0.5, 1.25], [1.5, -2.0]]
 
 
@@ -169,13 +169,16 @@ def test_matlab_variables_and_fields_are_columns(tmp_path: Path, form: str) -> N
         variables |= {"many": structures, "cells": cells, "z": 1j * t, "sparse": eye_array(3)}
     savemat(tmp_path / "x.mat", variables, format=form)
     table = read_table(tmp_path / "x.mat")
-    assert table.numbers(["t", "force"], 4, "here").tolist() == np.column_stack([t, force]).tolist()
+    assert (
+        table.finite_numbers(["t", "force"], 4, "here").tolist()
+        == np.column_stack([t, force]).tolist()
+    )
     if form == "5":
         whole = {name for name in table.columns if "[" not in name}
         assert whole == {"t", "force", "tool.R", "tool.imu.gyro"}
-        assert table.raw("tool.R[1]", "here")[:, 0].tolist() == turned[1::9].tolist()
-        assert table.numbers(["tool.R"], 9, "here").tolist() == turned.reshape(4, 9).tolist()
-        assert table.numbers(["tool.imu.gyro"], 3, "here").tolist() == (2 * force).tolist()
+        assert table.numbers_with_nan("tool.R[1]", "here")[:, 0].tolist() == turned[1::9].tolist()
+        assert table.finite_numbers(["tool.R"], 9, "here").tolist() == turned.reshape(4, 9).tolist()
+        assert table.finite_numbers(["tool.imu.gyro"], 3, "here").tolist() == (2 * force).tolist()
 
 
 @pytest.mark.parametrize(
@@ -260,13 +263,13 @@ def test_damaged_mat_file_raises_error(
 
 def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2\n3,4\n"), header=False)
-    assert table.numbers(["0", "1"], 2, "here").tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert table.finite_numbers(["0", "1"], 2, "here").tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def test_row_numbers_in_errors_include_comment_lines(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "# a\n# b\nt,f\n0,1\n1,oops\n"))
     with pytest.raises(DrakeTeleopError, match="'oops' in row 5"):
-        table.raw("f", "here")
+        table.numbers_with_nan("f", "here")
 
 
 @pytest.mark.parametrize(
@@ -301,7 +304,7 @@ def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -
 def test_decimal_step_is_the_quantization_of_printed_numbers(
     values: list[float], step: float
 ) -> None:
-    assert decimal_step(np.array(values)) == pytest.approx(step)
+    assert decimal_resolution(np.array(values)) == pytest.approx(step)
 
 
 PLAIN = "t,a\n0,1.5\n1,2.5\n"
@@ -328,14 +331,14 @@ def test_spreadsheet_formats_give_the_same_table(tmp_path: Path, name: str) -> N
     path = tmp_path / "x.csv"
     path.write_bytes(SPELLINGS[name].encode())
     table = read_table(path)
-    assert table.numbers(["t", "a"], 2, "here").tolist() == [[0.0, 1.5], [1.0, 2.5]]
+    assert table.finite_numbers(["t", "a"], 2, "here").tolist() == [[0.0, 1.5], [1.0, 2.5]]
 
 
 @pytest.mark.parametrize("cell", ["1_000", '"1,500"', "1_0.5", "_1", "1__0", "0x10", "\u0663"])
 def test_ambiguous_number_raises_error(tmp_path: Path, cell: str) -> None:
     for text in (f"t,a\n0,{cell}\n1,2.5\n", f"t,a\n0,2.5\n1,{cell}\n", f"t,a\n0,{cell}\n"):
         with pytest.raises(DrakeTeleopError):
-            read_table(write(tmp_path / "x.csv", text)).numbers(["a"], 1, "here")
+            read_table(write(tmp_path / "x.csv", text)).finite_numbers(["a"], 1, "here")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -364,7 +367,7 @@ def test_empty_array_is_ignored(tmp_path: Path) -> None:
     table = read_table(path)
     assert list(table.columns) == ["t"]
     with pytest.raises(DrakeTeleopError, match="has no column 'none'"):
-        table.raw("none", "here")
+        table.numbers_with_nan("none", "here")
     np.savez(path, none=np.zeros(0))
     with pytest.raises(DrakeTeleopError, match="holds no rows"):
         read_table(path)
@@ -374,7 +377,7 @@ def test_empty_array_is_ignored(tmp_path: Path) -> None:
 def test_complex_array_raises_error(tmp_path: Path, shape: tuple[int, ...]) -> None:
     np.savez(tmp_path / "x.npz", a=np.ones(shape) + 1j)
     with pytest.raises(DrakeTeleopError, match="is not a number"):
-        read_table(tmp_path / "x.npz").raw("a", "here")
+        read_table(tmp_path / "x.npz").numbers_with_nan("a", "here")
 
 
 FORKS = """

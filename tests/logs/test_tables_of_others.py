@@ -275,10 +275,10 @@ def test_formats_hold_the_same_columns(tmp_path: Path, suffix: str) -> None:
     names = (
         ["0", *map(str, range(1, 7))] if suffix == ".npy" else ["t", *(f"w[{k}]" for k in range(6))]
     )
-    np.testing.assert_array_equal(found.numbers(names[:1], 1, "")[:, 0], t)
-    np.testing.assert_array_equal(found.numbers(names[1:], 6, ""), w)
+    np.testing.assert_array_equal(found.finite_numbers(names[:1], 1, "")[:, 0], t)
+    np.testing.assert_array_equal(found.finite_numbers(names[1:], 6, ""), w)
     if suffix in (".h5", ".zarr"):
-        np.testing.assert_array_equal(found.numbers(["a.b"], 1, "")[:, 0], t)
+        np.testing.assert_array_equal(found.finite_numbers(["a.b"], 1, "")[:, 0], t)
         assert "image" not in found.columns
 
 
@@ -293,9 +293,14 @@ def test_structures_become_columns_and_other_columns_are_left_out(tmp_path: Path
     )
     frame.write_parquet(tmp_path / "table.parquet")
     found = read_table(tmp_path / "table.parquet")
-    np.testing.assert_array_equal(found.numbers(["wrench.force.x"], 1, "")[:, 0], np.arange(20.0))
+    np.testing.assert_array_equal(
+        found.finite_numbers(["wrench.force.x"], 1, "")[:, 0], np.arange(20.0)
+    )
     assert "ragged" not in found.columns and "image.bytes" not in found.columns
-    assert np.isnan(found.raw("holed[0]", "")[0, 0]) and found.raw("holed[0]", "")[1, 0] == 1.0
+    assert (
+        np.isnan(found.numbers_with_nan("holed[0]", "")[0, 0])
+        and found.numbers_with_nan("holed[0]", "")[1, 0] == 1.0
+    )
 
 
 def test_hdf5_data_in_other_files_are_not_read(tmp_path: Path) -> None:

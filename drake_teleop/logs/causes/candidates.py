@@ -11,11 +11,17 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.changes import add_step, find_contact_spans
-from drake_teleop.logs.causes.instants import CONSTANT_COLUMN, FORCES, G, R, S
+from drake_teleop.logs.causes.instants import (
+    CONSTANT_COLUMN,
+    GRAVITY,
+    ROTATION,
+    SPECIFIC_FORCE,
+    WRENCH,
+)
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
 
-EXTENSION_NAMES = (
+EXTENSIONS_BY_PLAUSIBILITY = (
     *("axes", "gravity", "weight", "torque factor", "offsets", "load", "linear drift", "gain"),
     *("frame", "rotation", "contact", "cable", "drift"),
 )
@@ -28,18 +34,23 @@ TORQUE_UNIT_FACTORS = tuple(
     if sign * ratio != 1.0
 )
 """Ratios of known units and signs between torque and force."""
-_SUFFICIENT_RESIDUAL_RATIO, _IMPOSSIBLE_SCORE = 0.5, 1000.0
-_SMALLEST_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
-_MASS_SHARE, _SMALLEST_ARM_M = 0.02, 0.004
-_SMALLEST_GAIN, _LARGEST_GAIN, _SMALLEST_SHIFT_M, _SMALLEST_ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
-_SIGNIFICANT, _LARGEST_SHIFT_M, _LARGEST_STIFFNESS = 10.0, 1.5, 1000.0  # 1, m, N/m
+_MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
+_MIN_TILT_DEG, _MAX_GRAVITY_ERROR_IF_TILTED, _MAX_GRAVITY_ERROR_IF_UPRIGHT = 0.25, 0.05, 0.02
+_MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
+_MIN_GAIN_ERROR = 0.003
+_MAX_GAIN_ERROR = 0.25
+_MIN_FRAME_SHIFT_M = 0.010
+_MIN_SENSOR_ROTATION_DEG = 1.0
+_MIN_MASS_OVER_DEVIATION = 10.0
+_MAX_FRAME_SHIFT_M = 1.5
+_MAX_CABLE_STIFFNESS_N_M = 1000.0
 _MIN_DRIFT_OVER_NOISE = 3.0
-_NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
-_FACTOR_SHARE, _FACTOR_LIMIT, _FACTOR_LIMIT_FAR = 0.02, 0.06, 0.2
-_MODERATE_FACTOR, _LIKELIHOOD_TOLERANCE, _FACTOR_ITERATIONS = 0.2, 1.0, 4
-_LOW_RESIDUAL_SHARE = 0.2
-_MAX_LIKELIHOOD_LOSS = 8.0  # of the logarithm; four standard deviations
-_DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
+_NEGATIVE_INERTIA_DEVIATIONS, _NEGATIVE_INERTIA_SHARE = 8.0, 0.1
+_FACTOR_ERROR_MARGIN, _MAX_FACTOR_ERROR, _MAX_ERROR_OF_EXTREME_FACTOR = 0.02, 0.06, 0.2
+_MIN_MODERATE_FACTOR, _LOG_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
+_DECISIVE_RESIDUAL_SHARE = 0.2
+_MAX_LOG_LIKELIHOOD_LOSS = 8.0  # of the logarithm; four standard deviations
+_MAX_SCORE_OF_UNKNOWN_UNIT = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,35 +74,35 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
     if first:
         yield from _axis_permutation_candidates(state)
     if data.gravity_W is not None:
-        if "gravity" not in model.parts:
+        if "gravity" not in model.extensions:
             yield from _fit_extension(
-                state, "gravity", [start_of_tilt_fit(state), None], _is_tilt_significant
+                state, "gravity", [start_parameters_of_tilt_fit(state), None], _is_tilt_significant
             )
-        if "weight" not in model.parts and data.accelerates_enough:
+        if "weight" not in model.extensions and data.accelerates_enough:
             yield from _fit_extension(state, "weight", [None], _is_weight_significant)
-    if "torque factor" not in model.parts and data.accelerates_enough:
+    if "torque factor" not in model.extensions and data.accelerates_enough:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
         found = add_step(state, kind)
         if found is not None:
             yield _scored_candidate(kind, state, found, times=1)
-    if not {"linear drift", "drift"} & set(model.parts):
+    if not {"linear drift", "drift"} & set(model.extensions):
         yield from _fit_extension(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
-        if c not in model.gains:
-            larger = state.refit(replace(model, gains=(*model.gains, c)))
+        if c not in model.gain_channels:
+            larger = state.refit(replace(model, gain_channels=(*model.gain_channels, c)))
             if (
-                _SMALLEST_GAIN
+                _MIN_GAIN_ERROR
                 < abs(larger.parameters_of_extension(f"gain {c}")[0][0])
-                < _LARGEST_GAIN
+                < _MAX_GAIN_ERROR
             ):
                 yield _scored_candidate("gain", state, larger)
-    if "frame" not in model.parts and data.accelerates_enough:
+    if "frame" not in model.extensions and data.accelerates_enough:
         yield from _fit_extension(
-            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _SMALLEST_SHIFT_M
+            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _MIN_FRAME_SHIFT_M
         )
-    if first and not model.parts:
-        angle = np.radians(_SMALLEST_ROTATION_DEG)
+    if first and not model.extensions:
+        angle = np.radians(_MIN_SENSOR_ROTATION_DEG)
         yield from _fit_extension(
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
         )
@@ -100,9 +111,9 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         larger = State.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
-    if data.positions and "cable" not in model.parts and data.accelerates_enough:
+    if data.has_positions and "cable" not in model.extensions and data.accelerates_enough:
         yield from _fit_extension(state, "cable", [None], lambda _: True)
-    if "drift" not in model.parts and "linear drift" not in model.parts:
+    if "drift" not in model.extensions and "linear drift" not in model.extensions:
         yield from _fit_extension(state, "drift", [None], _is_drift_significant)
 
 
@@ -132,7 +143,7 @@ def has_negative_mass(state: State) -> bool:
 
 
 def has_negative_inertia(state: State) -> bool:
-    if state.x[6] < _SIGNIFICANT * np.sqrt(state.fit.covariance[6, 6]):
+    if state.x[6] < _MIN_MASS_OVER_DEVIATION * np.sqrt(state.fit.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
@@ -141,29 +152,29 @@ def has_negative_inertia(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    smallest = _NEGATIVE_SHARE * natural_scales(state.x[6:16])[10]
-    return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, smallest))
+    smallest = _NEGATIVE_INERTIA_SHARE * natural_scales(state.x[6:16])[10]
+    return bool(least[0] < -max(_NEGATIVE_INERTIA_DEVIATIONS * deviation, smallest))
 
 
 def is_plausible(state: State) -> bool:
     if has_negative_inertia(state):
         return False
-    parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
+    parts, deviation = state.model.extensions, float(np.sqrt(state.fit.covariance[6, 6]))
     if "weight" in parts:
         removed = state.parameters_of_extension("weight")[0][0]
         # A robot adds no weight, and a removed weight requires an inertia to compare with.
-        if removed < -0.01 * state.x[6] or state.x[6] < _SIGNIFICANT * deviation:
+        if removed < -0.01 * state.x[6] or state.x[6] < _MIN_MASS_OVER_DEVIATION * deviation:
             return False
     if (
         "frame" in parts
-        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _LARGEST_SHIFT_M
+        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _MAX_FRAME_SHIFT_M
     ):
         return False
     if "cable" in parts:
-        if state.x[6] < _SIGNIFICANT * deviation:
+        if state.x[6] < _MIN_MASS_OVER_DEVIATION * deviation:
             return False
         K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _LARGEST_STIFFNESS)
+        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _MAX_CABLE_STIFFNESS_N_M)
     return True
 
 
@@ -176,11 +187,11 @@ def _is_tilt_significant(state: State) -> bool:
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > abs(size / right - 1.0)
-    share = _GRAVITY_SHARE if turned else _KNOWN_SHARE
-    return bool(angle > _SMALLEST_TILT_DEG and abs(size / right - 1.0) < share)
+    share = _MAX_GRAVITY_ERROR_IF_TILTED if turned else _MAX_GRAVITY_ERROR_IF_UPRIGHT
+    return bool(angle > _MIN_TILT_DEG and abs(size / right - 1.0) < share)
 
 
-def start_of_tilt_fit(state: State) -> Array | None:
+def start_parameters_of_tilt_fit(state: State) -> Array | None:
     """Return start parameters for fitting a very wrong direction of gravity; None if unknown."""
     y = state.data.select_rows(state.rows.used).y
     sums = y.T @ y
@@ -188,9 +199,9 @@ def start_of_tilt_fit(state: State) -> Array | None:
     J = np.zeros((7, 3, width))
     for i in range(3):
         J[i, i, CONSTANT_COLUMN] = 1.0
-        J[3, i, S.start + i] = J[3, i, G.start + i] = 1.0
-        J[4:, i, R.start + 3 * i : R.start + 3 * i + 3] = np.eye(3)
-    force = np.eye(width)[FORCES][:3]
+        J[3, i, SPECIFIC_FORCE.start + i] = J[3, i, GRAVITY.start + i] = 1.0
+        J[4:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = np.eye(3)
+    force = np.eye(width)[WRENCH][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
     found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
@@ -216,52 +227,54 @@ def _is_weight_significant(state: State) -> bool:
     removed, _ = state.parameters_of_extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
-    return bool(removed[0] > _MASS_SHARE * mass or moment > _SMALLEST_ARM_M)
+    return bool(removed[0] > _MIN_REMOVED_MASS_SHARE * mass or moment > _MIN_REMOVED_MOMENT_ARM_M)
 
 
 def _is_drift_significant(state: State) -> bool:
-    name = "drift" if "drift" in state.model.parts else "linear drift"
+    name = "drift" if "drift" in state.model.extensions else "linear drift"
     rows = state.parameters_of_extension(name)[0].reshape(6, -1)
-    return bool((np.abs(rows).sum(axis=1) > _MIN_DRIFT_OVER_NOISE * state.data.white).any())
+    return bool((np.abs(rows).sum(axis=1) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
 
 
 def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
     fits = []
     for factor in (1.0, *TORQUE_UNIT_FACTORS):
-        model = replace(state.model, factor=factor)
-        fits.append(state.refit(model, state.x, steps=_FACTOR_ITERATIONS))
+        model = replace(state.model, torque_factor=factor)
+        fits.append(state.refit(model, state.x, steps=_TORQUE_FACTOR_ITERATIONS))
     most = max(x.likelihood for x in fits)
-    best = next(x for x in fits if x.likelihood > most - _LIKELIHOOD_TOLERANCE)
+    best = next(x for x in fits if x.likelihood > most - _LOG_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
-    by_residual = least < _LOW_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
+    by_residual = least < _DECISIVE_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
     if by_residual:
         low = (x for x in fits if x.residual_ratio < 2.0 * least)
         best = max(low, key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    best = state.refit(best.model, best.x, **({"steps": _FACTOR_ITERATIONS} if by_residual else {}))
+    best = state.refit(
+        best.model, best.x, **({"steps": _TORQUE_FACTOR_ITERATIONS} if by_residual else {})
+    )
     if 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
     free = best.refit(best.model.with_extension("torque factor"))
     value, covariance = free.parameters_of_extension("torque factor")
     # A displaced pose frame resembles any factor, but only a distant frame resembles a large one.
-    far = not _MODERATE_FACTOR < best.model.factor < 1.0 / _MODERATE_FACTOR
-    most = _FACTOR_LIMIT_FAR if far else _FACTOR_LIMIT
-    limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
+    far = not _MIN_MODERATE_FACTOR < best.model.torque_factor < 1.0 / _MIN_MODERATE_FACTOR
+    most = _MAX_ERROR_OF_EXTREME_FACTOR if far else _MAX_FACTOR_ERROR
+    limit = min(_FACTOR_ERROR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, more=1)
     # A factor beside the known ratios is not a cause, but widens the intervals.
-    score = found.score if abs(value[0]) < limit else min(found.score, _DOUBTFUL_SCORE)
+    score = found.score if abs(value[0]) < limit else min(found.score, _MAX_SCORE_OF_UNKNOWN_UNIT)
     yield replace(found, score=score)
 
 
-def fits_with_similar_torque_factors(state: State) -> list[State]:
+def fits_with_other_torque_units(state: State) -> list[State]:
     """Return the fits with other torque units that explain the record nearly as well."""
-    factor, found = state.model.factor, []
+    factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
-            fitted = state.refit(replace(state.model, factor=other), state.x)
-            if fitted.likelihood > state.likelihood - _MAX_LIKELIHOOD_LOSS:
+            fitted = state.refit(replace(state.model, torque_factor=other), state.x)
+            if fitted.likelihood > state.likelihood - _MAX_LOG_LIKELIHOOD_LOSS:
                 found.append(fitted)
     return found
 
@@ -271,15 +284,15 @@ def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
     sums = y.T @ y
     sums = sums - np.outer(sums[:, CONSTANT_COLUMN], sums[CONSTANT_COLUMN]) / sums[0, 0]
     # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight
-    model = Model(parts=state.model.parts)
+    model = Model(extensions=state.model.extensions)
     used = [6, 7, 8, 9]
-    if "weight" in model.parts:
+    if "weight" in model.extensions:
         used.append(model.slices["weight"].start)
     J = model.wrench_derivative(np.zeros(model.size))[used, :3]
-    force = np.eye(len(sums))[FORCES][:3]
+    force = np.eye(len(sums))[WRENCH][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
-    total = float(np.trace(sums[FORCES, FORCES][:3, :3]))
+    total = float(np.trace(sums[WRENCH, WRENCH][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
     best: tuple[float, Array] = (np.inf, np.eye(3))
     plain = total
@@ -291,10 +304,10 @@ def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
             plain = left
         elif left < best[0]:
             best = (left, Q)
-    if best[0] < _SUFFICIENT_RESIDUAL_RATIO * plain:
+    if best[0] < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * plain:
         larger = state.refit(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _scored_candidate("axes", state, larger, more=3)
             # The given axes imply a negative mass, which is impossible.
-            more = _IMPOSSIBLE_SCORE if has_negative_inertia(state) else 0.0
+            more = _SCORE_OF_AVOIDED_NEGATIVE_MASS if has_negative_inertia(state) else 0.0
             yield replace(found, score=found.score + more)

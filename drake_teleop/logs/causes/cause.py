@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import fits_with_similar_torque_factors
+from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
 from drake_teleop.logs.causes.state import State
 
-_HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
+_MAX_HAND_CONTACT_DISTANCE_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
-TEMPORARY_CAUSES = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
+CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
 
 
@@ -56,7 +56,7 @@ class RecordPartWithLoad:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of_fit(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
+def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cause]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_wrong_axes_cause(model.axes))
@@ -69,10 +69,14 @@ def causes_of_fit(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
         "linear drift": _drift_cause,
         "drift": _drift_cause,
     }
-    out += [makers[name](state) for name in model.parts if name in makers and name not in given]
-    if model.factor != 1.0:
+    out += [
+        makers[name](state)
+        for name in model.extensions
+        if name in makers and name not in always_fitted
+    ]
+    if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
-    out += [_gain_error_cause(state, c) for c in model.gains]
+    out += [_gain_error_cause(state, c) for c in model.gain_channels]
     changes = [_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
     contacts = [span for span in state.spans if not _is_hand_contact(span, model.step_times)]
@@ -156,12 +160,12 @@ def _removed_weight_cause(state: State) -> Cause:
 
 
 def _torque_factor_cause(state: State) -> Cause:
-    factor = state.model.factor
+    factor = state.model.torque_factor
     if factor == -1.0:
         what = "the torque has the opposite sign"
     else:
         what = f"the torque is {factor:.6g} times the value that fits the force"
-        if others := [other.model.factor for other in fits_with_similar_torque_factors(state)]:
+        if others := [other.model.torque_factor for other in fits_with_other_torque_units(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
     return Cause("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
@@ -202,7 +206,7 @@ def _sensor_rotation_cause(state: State) -> Cause:
 
 
 def _drift_cause(state: State) -> Cause:
-    name = "drift" if "drift" in state.model.parts else "linear drift"
+    name = "drift" if "drift" in state.model.extensions else "linear drift"
     rows = state.parameters_of_extension(name)[0].reshape(6, -1)
     size = 2.0 * np.abs(rows).sum(axis=1)
     return Cause(
@@ -249,8 +253,11 @@ def _step_cause(state: State, i: int) -> Cause:
 
 
 def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    near = any(span[0] - _HAND_DISTANCE_S < time < span[1] + _HAND_DISTANCE_S for time in times)
-    return near and span[1] - span[0] < _HAND_CONTACT_S
+    near = any(
+        span[0] - _MAX_HAND_CONTACT_DISTANCE_S < time < span[1] + _MAX_HAND_CONTACT_DISTANCE_S
+        for time in times
+    )
+    return near and span[1] - span[0] < _MAX_HAND_CONTACT_DURATION_S
 
 
 def _contact_cause(start: float, stop: float) -> Cause:

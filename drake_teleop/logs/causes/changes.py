@@ -10,23 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
-from drake_teleop.logs.causes.instants import FORCES
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, StepChange
+from drake_teleop.logs.causes.instants import WRENCH
+from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
     State,
     TimeSpans,
+    first_order_gain,
     is_in_spans,
-    likelihood_gain,
     regularized_inverse,
 )
 
 _MIN_LIKELIHOOD_GAIN = 60.0
-_REFINEMENT_STEP_SHARES, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
-_MIN_DISTANCE_S, _RAMP_COST = 0.4, 80.0
-RAMP_S = 0.5
+_REFINEMENT_MOVES_INSTANTS, _MAX_REFINEMENT_MOVES = (1.0, 0.25), 2  # instants
+_MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
+OMITTED_RAMP_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
-_NUM_TRIED_TIMES = 2
-_SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.002
+_NUM_TRIED_STEP_TIMES = 2
+_SIGNIFICANT_DEVIATIONS = 5.0
+_MIN_STEP_OVER_NOISE = 2.0
+_MIN_MASS_STEP_SHARE = 0.01
+_MIN_MOMENT_STEP_ARM_M = 0.002
 
 
 def add_step(state: State, kind: str) -> State | None:
@@ -36,9 +39,9 @@ def add_step(state: State, kind: str) -> State | None:
     """
     best: State | None = None
     for time in _likely_step_times(state, kind):
-        found = _refine_time(state, kind, time)
+        found = _refine_step_time(state, kind, time)
         ramp = fit_with_ramps(state, [[kind]], [time], state.spans)
-        if 2.0 * (ramp.likelihood - found.likelihood) > _RAMP_COST:
+        if 2.0 * (ramp.likelihood - found.likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
             best = found
@@ -52,17 +55,17 @@ def _likely_step_times(state: State, kind: str) -> list[float]:
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.gain_of_change_at(int(n)) for n in starts])
     for time in state.model.step_times:
-        gains[np.abs(data.t[starts] - time) < _MIN_DISTANCE_S] = 0.0
+        gains[np.abs(data.t[starts] - time) < _MIN_TIME_BETWEEN_STEPS_S] = 0.0
     out: list[float] = []
-    for _ in range(_NUM_TRIED_TIMES):
+    for _ in range(_NUM_TRIED_STEP_TIMES):
         j = int(np.argmax(gains))
         if gains[j] < _MIN_LIKELIHOOD_GAIN:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
         time = float(data.t[max(near, key=scan.gain_of_change_at)]) - 0.5 * data.dt
-        if all(abs(time - x) > _MIN_DISTANCE_S for x in state.model.step_times):
+        if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in state.model.step_times):
             out.append(time)
-        distance = max(2.0 * _MIN_DISTANCE_S, 3.0 * rows * data.dt)
+        distance = max(2.0 * _MIN_TIME_BETWEEN_STEPS_S, 3.0 * rows * data.dt)
         gains[np.abs(data.t[starts] - time) < distance] = 0.0
     return out
 
@@ -99,7 +102,7 @@ class _StepScan:
         mixed = gram[:, which]
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
-        return likelihood_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+        return first_order_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
 def fit_with_ramps(
@@ -110,7 +113,7 @@ def fit_with_ramps(
     widths: Sequence[float] | None = None,
 ) -> State:
     """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
-    widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
+    widths = [max(OMITTED_RAMP_S, w + OMITTED_RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
@@ -119,7 +122,7 @@ def fit_with_ramps(
         state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
     )
     owners = [k for k, both in enumerate(kinds) for _ in both]
-    middles = [_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
+    middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
     return State.fit_record(state.data, model, found.x, found.spans)
@@ -131,22 +134,20 @@ def remove_small_steps(state: State) -> State:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
             return state
-        least = min(small, key=lambda i: _step_significance(state, i))
+        least = min(small, key=lambda i: _squared_step_over_variance(state, i))
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
-        x = np.concatenate(
-            [state.x[: DELAY_PARAMETER + 1], np.zeros(model.size - DELAY_PARAMETER - 1)]
-        )
+        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
         state = State.fit_record(state.data, model, x, state.spans)
 
 
-def _step_significance(state: State, i: int) -> float:
+def _squared_step_over_variance(state: State, i: int) -> float:
     where = state.model.slices[f"step {i}"]
     x, covariance = state.x[where], state.fit.covariance[where, where]
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _ramp_middle(
+def _estimate_ramp_middle(
     state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
 ) -> float:
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
@@ -155,27 +156,27 @@ def _ramp_middle(
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
-    def residual_after_steps(time: float) -> Array:
+    def residual_with_steps_at(time: float) -> Array:
         times = tuple(time if i in own else x.time for i, x in enumerate(state.model.steps))
         y = data.append_step_signals(times)[rows][:, state.model.columns]
         return np.asarray(y @ state.fit.residual.T)
 
-    before = residual_after_steps(span[1] + data.dt)
-    whole = before - residual_after_steps(span[0] - data.dt)
-    weight = 1.0 / np.maximum(data.white, 1e-12) ** 2
+    before = residual_with_steps_at(span[1] + data.dt)
+    whole = before - residual_with_steps_at(span[0] - data.dt)
+    weight = 1.0 / np.maximum(data.wrench_noise, 1e-12) ** 2
     share = (before * whole) @ weight / np.maximum((whole * whole) @ weight, 1e-12)
     done = float(np.clip(share, 0.0, 1.0).mean())
     return span[1] - done * (span[1] - span[0])
 
 
-def _refine_time(state: State, kind: str, time: float) -> State:
+def _refine_step_time(state: State, kind: str, time: float) -> State:
     def fit_with_step_at(time: float, start: Array | None = None) -> State:
         model = replace(state.model, steps=(*state.model.steps, StepChange(kind, time)))
         return state.refit(model, start)
 
     best = fit_with_step_at(time)
-    for share in _REFINEMENT_STEP_SHARES:
-        for _ in range(_REFINEMENT_STEPS):
+    for share in _REFINEMENT_MOVES_INSTANTS:
+        for _ in range(_MAX_REFINEMENT_MOVES):
             now = best.model.steps[-1].time
             tried = [
                 fit_with_step_at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)
@@ -192,20 +193,27 @@ def _is_step_significant(state: State, i: int) -> bool:
     values = state.x[where]
     deviations = np.sqrt(np.diag(state.fit.covariance[where, where]))
     if state.model.steps[i].kind == "offsets":
-        clear = np.abs(values) > _SIGNIFICANT * deviations
-        return bool((clear & (np.abs(values) > _NOISE_LEVELS * state.data.white)).any())
+        clear = np.abs(values) > _SIGNIFICANT_DEVIATIONS * deviations
+        return bool(
+            (clear & (np.abs(values) > _MIN_STEP_OVER_NOISE * state.data.wrench_noise)).any()
+        )
     mass = max(abs(state.x[6]), 1e-3)
-    heavier = abs(values[0]) > max(_SIGNIFICANT * deviations[0], _MASS_SHARE * mass)
+    heavier = abs(values[0]) > max(
+        _SIGNIFICANT_DEVIATIONS * deviations[0], _MIN_MASS_STEP_SHARE * mass
+    )
     size, moment = np.linalg.norm(values[1:4]), np.linalg.norm(deviations[1:4])
-    moved = size > max(2.0 * _SIGNIFICANT * moment, _SMALLEST_ARM_M * mass)
+    moved = size > max(2.0 * _SIGNIFICANT_DEVIATIONS * moment, _MIN_MOMENT_STEP_ARM_M * mass)
     return bool(heavier or moved)
 
 
-_KEPT_SHARES, _ITERATIONS, _FEWEST_BLOCKS, _BLOCK_SET_GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
-_START_LENGTHS, _END_LENGTHS = (8, 16, 32), (2, 4, 8)
-_CONTACT_LEVEL, _CALM_RATIO, _CALM_LEVEL_FACTOR = 8.0, 5.0, 1.3
-_MAX_LOADS, _MAX_STEPS, _SHORTEST_RUN, _MAX_UNCOVERED = 4, 4, 4, 0.12
-_LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
+_TRIED_KEPT_SHARES = (0.12, 0.3, 0.55)
+_MAX_TRIMMED_FIT_ITERATIONS = 15
+_MIN_FITTED_BLOCKS = 8
+_BLOCK_SET_GROWTH = 1.3
+_START_SET_LENGTHS_BLOCKS, _BOTH_ENDS_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
+_CONTACT_OVER_NOISE, _CONTACT_OVER_CALM, _EXCESS_OVER_CALM = 8.0, 5.0, 1.3
+_MAX_LOADS, _MAX_STEPS, _MIN_RUN_BLOCKS, _MAX_UNCOVERED_SHARE = 4, 4, 4, 0.12
+_MAX_RESIDUAL_INCREASE, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
 
 def find_contact_spans(state: State) -> TimeSpans:
@@ -217,7 +225,12 @@ def find_contact_spans(state: State) -> TimeSpans:
     wide = contact_blocks.copy()
     wide[:-1] |= contact_blocks[1:]
     wide[1:] |= contact_blocks[:-1]
-    return _spans_of_blocks(wide, state.data.t, state.data.rows_per_block)
+    t, rows = state.data.t, state.data.rows_per_block
+    half, last = 0.5 * float(t[1] - t[0]), len(t) - 1
+    return tuple(
+        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
+        for a, b in find_runs_of_true(wide)
+    )
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
@@ -228,10 +241,10 @@ def replace_contacts_by_steps(larger: State) -> State | None:
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _keep_long_runs(left & ~contact_blocks, _SHORTEST_RUN)
+        calm = _keep_long_runs(left & ~contact_blocks, _MIN_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
-    if not len(inner) or left.sum() > _MAX_UNCOVERED * blocks.usable.sum():
+    if not len(inner) or left.sum() > _MAX_UNCOVERED_SHARE * blocks.usable.sum():
         return None
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
     if not 0 < len(borders) <= _MAX_STEPS:
@@ -242,7 +255,7 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
     found = fit_with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
     found = remove_small_steps(found)
-    limit = max(_LARGEST_INCREASE * larger.residual_ratio, _SMALL_RESIDUAL)
+    limit = max(_MAX_RESIDUAL_INCREASE * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
 
@@ -260,13 +273,13 @@ class _ResidualBlocks:
         data = state.data
         self._state = state
         y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
-        sums = data.lagged_products(y, rows=data.rows_per_block, lags=1)[:, 0]
+        sums = data.lagged_block_sums(y, rows=data.rows_per_block, lags=1)[:, 0]
         self._counts = sums[:, 0, 0]
         self.usable = self._counts > 0.5 * data.rows_per_block
         J = state.model.wrench_derivative(state.x)
-        sizes = np.sqrt(np.diag(sums.sum(axis=0))[FORCES] / max(self._counts.sum(), 1.0))
+        sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
-        scale = np.maximum(data.white, least)
+        scale = np.maximum(data.wrench_noise, least)
         self._gram = np.zeros((len(sums), len(J), len(J)))
         self._right = np.zeros((len(sums), len(J)))
         self._square = np.zeros(len(sums))
@@ -279,55 +292,59 @@ class _ResidualBlocks:
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return True for blocks `among` with a residual far above the calmest; None for few."""
-        found = self._fit_calmest(np.flatnonzero(among))
+        found = self._fit_calmest_blocks(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
-        excess = np.sqrt(np.maximum(level**2 - (_CALM_LEVEL_FACTOR * calm) ** 2, 0.0))
-        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CALM_RATIO * calm)))
+        excess = np.sqrt(np.maximum(level**2 - (_EXCESS_OVER_CALM * calm) ** 2, 0.0))
+        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_OVER_CALM * calm)))
         by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
         usual = np.hypot(calm, by_motion)
-        return np.asarray((level > _CONTACT_LEVEL) & (level > _CALM_RATIO * usual) & among)
+        return np.asarray(
+            (level > _CONTACT_OVER_NOISE) & (level > _CONTACT_OVER_CALM * usual) & among
+        )
 
-    def _fit_calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        if len(blocks) < 2 * _FEWEST_BLOCKS:
+    def _fit_calmest_blocks(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
+        if len(blocks) < 2 * _MIN_FITTED_BLOCKS:
             return None
         starts = [blocks]
-        for length in _START_LENGTHS:
+        for length in _START_SET_LENGTHS_BLOCKS:
             begins = range(0, len(blocks) - length // 2, length // 2)
             starts += [blocks[k : k + length] for k in begins]
         found, usual = [], np.inf
-        for kept, share in product(starts, _KEPT_SHARES):
+        for kept, share in product(starts, _TRIED_KEPT_SHARES):
             level, move, last = self._trimmed_fit(blocks, kept, share)
             found.append((level, move))
-            if share == _KEPT_SHARES[1]:
+            if share == _TRIED_KEPT_SHARES[1]:
                 usual = min(usual, float(np.median(level[last])))
-        for length in _END_LENGTHS:
+        for length in _BOTH_ENDS_LENGTHS_BLOCKS:
             level, move, last = self._trimmed_fit(
                 blocks, np.r_[blocks[:length], blocks[-length:]], 0.0
             )
             calm = float(np.median(level[last]))
-            if self._differs_from_fit(level, last, np.setdiff1d(blocks, last), calm):
+            if self._do_other_blocks_differ(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
-        limit = max(_CONTACT_LEVEL**2, (_CALM_RATIO**2) * usual)
+        limit = max(_CONTACT_OVER_NOISE**2, (_CONTACT_OVER_CALM**2) * usual)
         level, move = min(found, key=lambda x: float(np.minimum(x[0][blocks], limit).sum()))
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _differs_from_fit(
+    def _do_other_blocks_differ(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
-        return bool(np.mean(level[others] > _CALM_RATIO**2 * predicted) > 1.0 - _MAX_UNCOVERED)
+        return bool(
+            np.mean(level[others] > _CONTACT_OVER_CALM**2 * predicted) > 1.0 - _MAX_UNCOVERED_SHARE
+        )
 
     def _trimmed_fit(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
     ) -> tuple[Array, Array, NDArray[np.intp]]:
-        keep = max(_FEWEST_BLOCKS, int(share * len(blocks)))
-        for _ in range(_ITERATIONS):
+        keep = max(_MIN_FITTED_BLOCKS, int(share * len(blocks)))
+        for _ in range(_MAX_TRIMMED_FIT_ITERATIONS):
             move = regularized_inverse(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
             left = self._square - 2.0 * self._right @ move + (self._gram @ move) @ move
             level = left / (6.0 * np.maximum(self._counts, 1.0))
@@ -347,7 +364,7 @@ def _motion_error_level(
     wrench = y @ state.model.wrench_coefficients(x[None])[0].T
     bend = np.zeros(len(y))
     both = data.used[2:] & data.used[:-2]
-    second = np.diff(wrench, 2, axis=0) / np.maximum(data.white, 1e-12)
+    second = np.diff(wrench, 2, axis=0) / np.maximum(data.wrench_noise, 1e-12)
     bend[1:-1] = np.where(both, (second * second).sum(axis=1), 0.0)
     blocks = np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows
     fast = np.sqrt(blocks[: len(level)])
@@ -369,16 +386,16 @@ def replace_steps_by_contact(state: State) -> State:
             continue
         kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
         model = replace(state.model, steps=kept)
-        x = np.concatenate(
-            [state.x[: DELAY_PARAMETER + 1], np.zeros(model.size - DELAY_PARAMETER - 1)]
-        )
+        x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
             return State.fit_record(state.data, model, x, (*state.spans, span))
-        if _median_residual_ratio(state, span) > _CONTACT_LEVEL:
+        if _median_residual_over_noise(state, span) > _CONTACT_OVER_NOISE:
             calm = State.fit_record(state.data, model, x, (*state.spans, span))
-            if calm.residual_ratio < min(_CALM_RATIO, state.residual_ratio / _CALM_RATIO):
+            if calm.residual_ratio < min(
+                _CONTACT_OVER_CALM, state.residual_ratio / _CONTACT_OVER_CALM
+            ):
                 return shrink_contacts(calm)
     return state
 
@@ -396,8 +413,10 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
     data = state.data
     inside = np.flatnonzero(data.used & is_in_spans(data, (span,)))
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
-    usual = np.maximum(np.maximum(data.white, state.rows.residual_rms(state.fit.residual)), 1e-12)
-    large = (np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual).any(axis=1)
+    usual = np.maximum(
+        np.maximum(data.wrench_noise, state.rows.residual_rms(state.fit.residual)), 1e-12
+    )
+    large = (np.abs(y[inside] @ state.fit.residual.T) > _CONTACT_OVER_CALM * usual).any(axis=1)
     first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
     if not len(first):
         return span
@@ -405,12 +424,12 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
     return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
 
 
-def _median_residual_ratio(state: State, span: tuple[float, float]) -> float:
+def _median_residual_over_noise(state: State, span: tuple[float, float]) -> float:
     chosen = state.rows.used & is_in_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
     e = np.abs(state.rows.y[chosen] @ state.fit.residual.T)
-    return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.white, 1e-12)).max())
+    return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.wrench_noise, 1e-12)).max())
 
 
 def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
@@ -422,12 +441,3 @@ def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
     covariance = state.fit.covariance
     variance = np.diag(covariance[a, a] + covariance[b, b] + 2.0 * covariance[a, b])
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())
-
-
-def _spans_of_blocks(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> TimeSpans:
-    half = 0.5 * float(t[1] - t[0])
-    last = len(t) - 1
-    return tuple(
-        (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
-        for a, b in find_runs_of_true(contact_blocks)
-    )

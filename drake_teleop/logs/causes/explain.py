@@ -9,13 +9,13 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.logs.causes.candidates import (
-    EXTENSION_NAMES,
+    EXTENSIONS_BY_PLAUSIBILITY,
     Candidate,
     fit_candidates,
     has_negative_inertia,
     has_negative_mass,
     is_plausible,
-    start_of_tilt_fit,
+    start_parameters_of_tilt_fit,
 )
 from drake_teleop.logs.causes.cause import (
     Cause,
@@ -30,36 +30,37 @@ from drake_teleop.logs.causes.changes import (
 )
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
-    block_deviations,
+    GOOD_SMOOTH_MISFIT,
     gain_covariance,
+    jackknife_over_parts,
     load_covariance,
     misfit_deviations,
     torque_unit_covariance,
 )
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, LOAD_PARAMETERS, Model
+from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
 from drake_teleop.logs.causes.state import State
 
 MAX_SEARCH_ROUNDS = 4
 InstantsAtDelay = Callable[[float], Instants]
-_SMALLEST_DELAY_S, _LARGEST_DELAY_S, _SAME_DELAY_S, _DELAY_ITERATIONS = 5e-4, 0.3, 0.004, 4  # s
+_MIN_CORRECTED_DELAY_S = 5e-4
+_MAX_CORRECTED_DELAY_S = 0.3
+_EQUAL_DELAY_TOLERANCE_S = 0.004
+_DELAY_ITERATIONS = 4
 MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
 _MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
-_HALVED, _CONTACT_RESIDUAL_RATIO, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = (
-    0.5,
-    0.2,
-    15.0,
-    0.9,
-    1000.0,
-)
-_ATTENUATED_SHARE = 1.0 / 3.0
-_GOOD_SMOOTH_MISFIT = 1.35
-"""Largest smooth misfit of good records."""
-_STEP_CAUSES, _LARGEST_INCREASE = ("offsets", "load"), 3.0
+_HALVED_RESIDUAL = 0.5
+_MUCH_SMALLER_RESIDUAL = 0.2
+_COLOURED_NOISE_RATIO = 15.0
+_REDUCED_MISFIT_SHARE = 0.9
+_CERTAIN_SCORE = 1000.0
+_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
+_STEP_CAUSES, _MAX_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
-_FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"), 80.0, 0.1
-"""Causes with many columns, which resemble others; required margins of their scores."""
+_FLEXIBLE_CAUSES = ("cable", "drift")
+"""Causes with many columns, which resemble others and require margins of their scores."""
+_FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE = 80.0, 0.1
 
 
 def residual_is_noise(state: State) -> bool:
@@ -73,8 +74,12 @@ def residual_is_noise(state: State) -> bool:
     parts = ["frame", "linear drift", "rotation"]
     if state.data.gravity_W is not None:
         parts += ["gravity", "weight"]
-    larger = [model.with_extension(name) for name in parts if name not in model.parts]
-    larger += [replace(model, gains=(*model.gains, c)) for c in range(6) if c not in model.gains]
+    larger = [model.with_extension(name) for name in parts if name not in model.extensions]
+    larger += [
+        replace(model, gain_channels=(*model.gain_channels, c))
+        for c in range(6)
+        if c not in model.gain_channels
+    ]
     return all(state.score(x) < MAX_EXTENSION_SCORE for x in larger)
 
 
@@ -82,13 +87,13 @@ SearchResult = tuple[State, float, list[Candidate]]
 
 
 def search_causes(
-    data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
+    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
     Arguments are as for `explain_misfit`.
     """
-    plain = Model(parts=given)
+    plain = Model(extensions=always_fitted)
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
@@ -96,32 +101,30 @@ def search_causes(
             _initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay
         )
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
-        is_wrench = opposite[0].model.factor > 0.0
+        is_wrench = opposite[0].model.torque_factor > 0.0
         if (
             is_wrench
-            and opposite[0].residual_ratio < _CONTACT_RESIDUAL_RATIO * found[0].residual_ratio
+            and opposite[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
         ):
             found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
     delay_s = delay_of_free_fit(data)
-    if abs(delay_s - found[1]) < _SAME_DELAY_S:
+    if abs(delay_s - found[1]) < _EQUAL_DELAY_TOLERANCE_S:
         return found
     repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
     better = (
         residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
     )
     better = better or (
-        repeated[0].residual_ratio < _CONTACT_RESIDUAL_RATIO * found[0].residual_ratio
+        repeated[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
     )
     return repeated if better else found
 
 
 def may_be_coloured_noise(state: State) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
-    return (
-        state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
-    )
+    return state.smooth_misfit < GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
 
 
 def is_clear_misfit(state: State) -> bool:
@@ -131,14 +134,14 @@ def is_clear_misfit(state: State) -> bool:
 
 def _initial_state(data: Instants, model: Model) -> State:
     state = State.fit_record(data, model)
-    start = start_of_tilt_fit(state) if "gravity" in model.parts else None
+    start = start_parameters_of_tilt_fit(state) if "gravity" in model.extensions else None
     return state if start is None else State.fit_record(data, state.model, start)
 
 
 def _search_causes_from(
     state: State, delay_s: float, with_delay: InstantsAtDelay | None
 ) -> SearchResult:
-    state, delay_s = _remove_delay(state, delay_s, with_delay)
+    state, delay_s = _apply_fitted_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
@@ -150,20 +153,20 @@ def _search_causes_from(
             _best_candidate(effective),
             _candidate_with_smallest_residual(state, rejected),
         )
-        if winner is None or _much_smaller_residual(calmest, winner):
+        if winner is None or _has_much_smaller_residual(calmest, winner):
             winner = calmest
         if winner is None:
-            explained = _remove_contact_candidate(state, rejected)
+            explained = _explain_contact_by_steps(state, rejected)
             if explained is None:
                 break
-            state, delay_s = _remove_delay(explained, delay_s, with_delay)
+            state, delay_s = _apply_fitted_delay(explained, delay_s, with_delay)
             continue
         larger = replace_steps_by_contact(winner.state)
         if winner.name == "contact":
             larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
         elif larger.spans != winner.state.spans:
             larger = replace_contacts_by_steps(larger) or larger
-        state, delay_s = _remove_delay(larger, delay_s, with_delay)
+        state, delay_s = _apply_fitted_delay(larger, delay_s, with_delay)
         rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
             return state, delay_s, []
@@ -174,22 +177,22 @@ def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
-    return [x for x in found if x.name != "cable" or best < _ATTENUATED_SHARE * x.score]
+    return [x for x in found if x.name != "cable" or best < _WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
-def _remove_delay(
+def _apply_fitted_delay(
     state: State, delay_s: float, with_delay: InstantsAtDelay | None
 ) -> tuple[State, float]:
     for _ in range(_DELAY_ITERATIONS):
         if (
             with_delay is None
-            or abs(state.x[DELAY_PARAMETER]) < _SMALLEST_DELAY_S
-            or abs(delay_s) > _LARGEST_DELAY_S
+            or abs(state.x[DELAY_INDEX]) < _MIN_CORRECTED_DELAY_S
+            or abs(delay_s) > _MAX_CORRECTED_DELAY_S
         ):
             break
-        delay_s += float(state.x[DELAY_PARAMETER])
+        delay_s += float(state.x[DELAY_INDEX])
         x = state.x.copy()
-        x[DELAY_PARAMETER] = 0.0
+        x[DELAY_INDEX] = 0.0
         state = State.fit_record(with_delay(delay_s), state.model, x, state.spans)
     return state, delay_s
 
@@ -197,24 +200,24 @@ def _remove_delay(
 def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
     small = [x for x in found if x.name in _SMOOTH_CAUSES]
     small = [
-        x for x in small if x.state.residual_ratio < _CONTACT_RESIDUAL_RATIO * state.residual_ratio
+        x for x in small if x.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * state.residual_ratio
     ]
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
-    return min(near, key=lambda x: EXTENSION_NAMES.index(x.name), default=None)
+    return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)
 
 
-def _much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
+def _has_much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
     if calmest is None or calmest.name == "contact":
         return False
-    return calmest.state.residual_ratio < _CONTACT_RESIDUAL_RATIO * winner.state.residual_ratio
+    return calmest.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * winner.state.residual_ratio
 
 
-def _remove_contact_candidate(state: State, found: list[Candidate]) -> State | None:
+def _explain_contact_by_steps(state: State, found: list[Candidate]) -> State | None:
     for candidate in found:
         if (
             candidate.name == "contact"
-            and candidate.state.residual_ratio < _HALVED * state.residual_ratio
+            and candidate.state.residual_ratio < _HALVED_RESIDUAL * state.residual_ratio
         ):
             return replace_contacts_by_steps(candidate.state)
     return None
@@ -222,15 +225,15 @@ def _remove_contact_candidate(state: State, found: list[Candidate]) -> State | N
 
 def _is_effective(candidate: Candidate, state: State) -> bool:
     fitted = candidate.state
-    smaller = fitted.residual_ratio < _REDUCED * state.residual_ratio
+    smaller = fitted.residual_ratio < _REDUCED_MISFIT_SHARE * state.residual_ratio
     if candidate.name == "cable":
         return smaller  # the force of a cable far exceeds the noise
     if (
         candidate.name not in _STEP_CAUSES
-        and fitted.residual_ratio > _LARGEST_INCREASE * state.residual_ratio
+        and fitted.residual_ratio > _MAX_RESIDUAL_INCREASE * state.residual_ratio
     ):
         return False  # the candidate increases the residual, and coloured noise predicts it
-    better = smaller or fitted.smooth_misfit < _REDUCED * state.smooth_misfit
+    better = smaller or fitted.smooth_misfit < _REDUCED_MISFIT_SHARE * state.smooth_misfit
     return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_SCORE)
 
 
@@ -242,19 +245,19 @@ def _best_candidate(found: list[Candidate]) -> Candidate | None:
     margin = (
         max(_SCORE_MARGIN, _SCORE_MARGIN_SHARE * best)
         if top not in _FLEXIBLE_CAUSES
-        else max(_FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE * best)
+        else max(_FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE * best)
     )
     near = [x for x in found if x.score > max(_MIN_SCORE, best - margin)]
-    first = min(near, key=lambda x: EXTENSION_NAMES.index(x.name))
+    first = min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name))
     return (
         first
         if first.score
-        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / _GOOD_SMOOTH_MISFIT) ** 1.5
+        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
         else None
     )
 
 
-_NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
+_MAX_ABSENT_MASS_KG, _ABSENT_MASS_DEVIATIONS, _SIGNIFICANT_DEVIATIONS = 0.010, 4.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +271,7 @@ class Explanation:
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
-        given: quantities that are always estimated, such as "gravity", and are no causes.
+        always_fitted: quantities such as "gravity", which are no causes.
     """
 
     causes: tuple[Cause, ...]
@@ -280,34 +283,34 @@ class Explanation:
     loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
     state: State
-    given: tuple[str, ...] = ()
+    always_fitted: tuple[str, ...] = ()
 
     @property
     def is_misfit(self) -> bool:
         return not self.explained and is_clear_misfit(self.state)
 
     @property
-    def several_gains(self) -> bool:
+    def has_several_gains(self) -> bool:
         """Whether several gain errors were found, which only approximate a full gain matrix."""
         model = self.state.model
-        others = {"rotation", "cable"} & set(model.parts)
-        return len(model.gains) > 1 or bool(model.gains and others)
+        others = {"rotation", "cable"} & set(model.extensions)
+        return len(model.gain_channels) > 1 or bool(model.gain_channels and others)
 
 
 def explain_misfit(
-    data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
+    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    The model contains the extensions `given`, such as "weight", from the start. `with_delay`
-    returns the record with an additional delay [s].
+    The model contains the extensions `always_fitted`, such as "weight", from the start.
+    `with_delay` returns the record with an additional delay [s].
     """
     with one_blas_thread():
-        state, delay_s, rejected = search_causes(data, with_delay, given)
-        blocks = block_deviations(state)
+        state, delay_s, rejected = search_causes(data, with_delay, always_fitted)
+        blocks = jackknife_over_parts(state)
         gains = gain_covariance(state) + torque_unit_covariance(state)
         covariance = load_covariance(state, rejected, blocks, gains)
-        causes = causes_of_fit(state, given)
+        causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
         if (
             not causes
@@ -316,25 +319,28 @@ def explain_misfit(
         ):
             causes = [_no_load_cause(state, covariance)]
         removed = None
-        if "weight" in state.model.parts:
+        if "weight" in state.model.extensions:
             removed = state.x[state.model.slices["weight"]]
         return Explanation(
             causes=tuple(causes),
             explained=only_noise,
-            theta=state.x[LOAD_PARAMETERS],
+            theta=state.x[OFFSETS_AND_LOAD],
             covariance=covariance,
             deviations=misfit_deviations(state, rejected, blocks, gains),
-            delay_s=delay_s + float(state.x[DELAY_PARAMETER]),
+            delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(loads_between_changes(state, covariance)),
             removed_weight=removed,
             state=state,
-            given=given,
+            always_fitted=always_fitted,
         )
 
 
 def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
-    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
+    least = max(
+        _ABSENT_MASS_DEVIATIONS * deviation,
+        min(_MAX_ABSENT_MASS_KG, _SIGNIFICANT_DEVIATIONS * deviation),
+    )
     return bool(mass < least and deviation < 0.1)
 
 

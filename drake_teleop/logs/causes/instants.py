@@ -21,25 +21,29 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 
 MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
-CONSTANT_COLUMN, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
-FORCES, RATES, R, RP, TIME = (
-    slice(16, 22),
-    slice(22, 28),
-    slice(28, 37),
-    slice(37, 64),
-    slice(64, 67),
-)
+CONSTANT_COLUMN = 0
+SPECIFIC_FORCE = slice(1, 4)
+GRAVITY = slice(4, 7)
+ALPHA = slice(7, 10)
+OMEGA_PRODUCTS = slice(10, 16)
+WRENCH = slice(16, 22)
+WRENCH_RATE = slice(22, 28)
+ROTATION = slice(28, 37)
+R_P_PRODUCTS = slice(37, 64)
+TIME_POLYNOMIALS = slice(64, 67)
 NUM_SIGNALS = 67
 MOTION_COLUMNS = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
-_RATE_HZ, _MAX_ROWS = 50.0, 20_000
+_INSTANT_RATE_HZ, _MAX_ROWS = 50.0, 20_000
 _BLOCK_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
-_MAX_EXACT_SIZE, _MIN_ACCELERATION_RATIO, _MAX_NOISE_SHARE = 5, 4.0, 1.0 / 64.0
-_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular acceleration [rows]
-_MIN_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
+_MAX_EXACTLY_AVERAGED_SAMPLES = 5
+_MIN_ACCELERATION_OVER_NOISE = 4.0
+_MAX_ALPHA_NOISE_SHARE = 1.0 / 64.0
+_ALPHA_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
+_MIN_WRENCH_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
-_MOTION_SIGNALS = slice(0, 16)
-_PRODUCT_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_LOAD_SIGNAL_COLUMNS = slice(0, 16)
+SYMMETRIC_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 MotionAtTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
@@ -53,7 +57,7 @@ class Instants:
         t: (M,) middle of each block [s].
         y: (M, 67) signals of the module docstring; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
-        white: (6,) standard deviation of white wrench noise in a block mean.
+        wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
         acceleration_noise: standard deviation in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
@@ -62,9 +66,9 @@ class Instants:
     t: Array
     y: Array
     used: NDArray[np.bool_]
-    white: Array
+    wrench_noise: Array
     gravity_W: Array | None
-    positions: bool
+    has_positions: bool
     acceleration_noise: float = 0.0
     alpha_noise_share: float = 0.0
 
@@ -72,10 +76,10 @@ class Instants:
     def accelerates_enough(self) -> bool:
         """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
-            return self.alpha_noise_share < _MAX_NOISE_SHARE
-        a = (self.y[:, S] + self.y[:, G])[self.used]
+            return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
+        a = (self.y[:, SPECIFIC_FORCE] + self.y[:, GRAVITY])[self.used]
         return bool(
-            np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_RATIO * self.acceleration_noise
+            np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_OVER_NOISE * self.acceleration_noise
         )
 
     @property
@@ -99,7 +103,7 @@ class Instants:
             parts.append(self.y[:, MOTION_COLUMNS] * share[:, None])
         return np.hstack(parts)
 
-    def lagged_products(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
+    def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
         """Return sums over blocks of products of y (M, W) with earlier y, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
@@ -129,54 +133,55 @@ def block_means_of_record(
     [m/s^2], None without orientation. Samples with `lost` True are ignored.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
-    size = max(1, round(1.0 / (_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
+    size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
     rows = len(t) // size
     t, wrench = t[: rows * size], wrench[: rows * size]
     middle = t.reshape(rows, size).mean(axis=1)
     y = np.zeros((rows, NUM_SIGNALS))
     y[:, CONSTANT_COLUMN] = 1.0
-    y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
-    y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
+    y[:, WRENCH] = wrench.reshape(rows, size, 6).mean(axis=1)
+    y[1:-1, WRENCH_RATE] = (y[2:, WRENCH] - y[:-2, WRENCH]) / (2.0 * size * dt)
     positions = _write_motion(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
-    y[:, TIME] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)  # Legendre
+    # Legendre polynomials.
+    y[:, TIME_POLYNOMIALS] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
     used = np.ones(rows, bool)
     used[[0, -1]] = False
     if lost is not None:
         used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
-    white = white_noise(wrench)
+    white = white_noise_deviations(wrench)
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
-    white = np.maximum(white, _MIN_NOISE_SHARE * spread)
-    share = _smooth_alpha(y, used) if gravity_W is None else 0.0
+    white = np.maximum(white, _MIN_WRENCH_NOISE_SHARE * spread)
+    share = _smooth_noisy_alpha(y, used) if gravity_W is None else 0.0
     out = Instants(
         middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
     )
     return out.select_rows(used)
 
 
-def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
+def _smooth_noisy_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
     alpha = y[used][:, ALPHA]
-    share = _noise_share(alpha)
-    for width in _SMOOTHING_WIDTHS:
-        if _noise_share(alpha) < _MAX_NOISE_SHARE or width >= len(alpha):
+    share = _smallest_noise_share(alpha)
+    for width in _ALPHA_SMOOTHING_WIDTHS:
+        if _smallest_noise_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
         alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
     y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
     return share
 
 
-def white_noise(x: Array) -> Array:
+def white_noise_deviations(x: Array) -> Array:
     """Return the standard deviation (k,) of white noise in smooth signals x (N, k)."""
     # Column by column, to save memory.
     medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
     return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
-def _noise_share(x: Array) -> float:
-    noise = white_noise(x)
+def _smallest_noise_share(x: Array) -> float:
+    noise = white_noise_deviations(x)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
@@ -188,7 +193,7 @@ def _write_motion(
         columns = _signal_columns([x[: rows * size] for x in motion], gravity_W)
         _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(motion) == 5
-    if size <= _MAX_EXACT_SIZE:
+    if size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
         found = motion(t)
         columns = _signal_columns(found, gravity_W)
         _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
@@ -207,12 +212,12 @@ def _write_motion(
 
 def _write_signal_columns(y: Array, columns: Array) -> None:
     y[:, 1:16] = columns[:, :15]
-    y[:, R.start : R.start + columns.shape[1] - 15] = columns[:, 15:]
+    y[:, ROTATION.start : ROTATION.start + columns.shape[1] - 15] = columns[:, 15:]
 
 
 def _signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     s, omega, alpha = motion[:3]
-    products = np.stack([omega[:, i] * omega[:, k] for i, k in _PRODUCT_AXES], axis=1)
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in SYMMETRIC_ENTRIES], axis=1)
     if len(motion) == 3 or gravity_W is None:
         return np.hstack([s, np.zeros_like(s), alpha, products])
     R_SW = np.swapaxes(motion[3], 1, 2)
@@ -229,8 +234,8 @@ def delay_of_free_fit(data: Instants) -> float:
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
-    spline = CubicSpline(data.t, data.y[:, _MOTION_SIGNALS])
-    forces = data.y[rows][:, FORCES]
+    spline = CubicSpline(data.t, data.y[:, _LOAD_SIGNAL_COLUMNS])
+    forces = data.y[rows][:, WRENCH]
     total = (forces * forces).sum(axis=0)
 
     def log_residual(shift: float) -> float:

@@ -10,36 +10,37 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
-from drake_teleop.logs.causes.candidates import Candidate, fits_with_similar_torque_factors
-from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
-from drake_teleop.logs.causes.model import LOAD_PARAMETERS
+from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
+from drake_teleop.logs.causes.instants import ALPHA, WRENCH, white_noise_deviations
+from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
 from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
-_TOLERATED_RESIDUAL_RATIO, _USUAL_RESIDUAL_RATIO = 1.5, 1.15
-_GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
-_SMALLEST_SCORE, _CERTAIN_SCORE, _SUFFICIENT_RESIDUAL_RATIO = 6.0, 15.0, 0.5
-_CABLE_FACTOR, _LARGE_RESIDUAL_RATIO, _CLEAR_SMOOTH_MISFIT, _LARGE_SMOOTH_MISFIT = (
-    1.5,
-    20.0,
-    2.2,
-    6.0,
-)
-_CHANGING_CAUSES = ("offsets", "load", "linear drift", "drift")
+_TOLERATED_JACKKNIFE_RATIO, _USUAL_JACKKNIFE_RATIO = 1.5, 1.15
+GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
+"""Largest smooth misfit of good records; growth of the deviations above it."""
+_MIN_INCLUDED_SCORE, _FULLY_INCLUDED_SCORE, _FULLY_INCLUDED_RESIDUAL_SHARE = 6.0, 15.0, 0.5
+_CABLE_DEVIATION_FACTOR = 1.5
+_LARGE_RESIDUAL_RATIO = 20.0
+_CLEAR_SMOOTH_MISFIT = 2.2
+_LARGE_SMOOTH_MISFIT = 6.0
+_CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
 """Causes whose effects are included in the jackknife."""
-_GAIN_ERRORS, _MIN_GAIN_LIKELIHOOD, _MIN_GAIN_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
-_LARGEST_GAIN_ERROR = 0.025
+_TRIED_GAIN_DEVIATIONS = np.geomspace(1e-4, 0.1, 31)
+_MIN_LIKELIHOOD_GAIN = 20.0
+_MIN_SHARE_EXPLAINED_BY_GAINS = 0.5
+_MAX_GAIN_DEVIATION = 0.025
 
 
 def load_covariance(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
-    out = state.fit.covariance[LOAD_PARAMETERS, LOAD_PARAMETERS].copy()
+    out = state.fit.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
     deviations = np.sqrt(np.diag(out))
-    factor = misfit_factor(state, blocks)
+    factor = misfit_deviation_factor(state, blocks)
     squares = np.maximum(factor * deviations, blocks) ** 2
-    squares = squares + _squared_distances(state, rejected)
+    squares = squares + _variances_of_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
     return np.asarray(out * np.outer(ratio, ratio) + gains)
 
@@ -53,23 +54,25 @@ def misfit_deviations(
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
         else _LARGE_SMOOTH_MISFIT
     ):
-        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - _GOOD_SMOOTH_MISFIT))
-    lasting = [x for x in rejected if x.name not in _CHANGING_CAUSES]
-    variance = blocks**2 + _squared_distances(state, lasting) + np.diag(gains)
+        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
+    lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
+    variance = blocks**2 + _variances_of_rejected_causes(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
 
 
-def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
+def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -> Array:
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
         share = (
-            min(1.0, candidate.score / _CERTAIN_SCORE) if candidate.score > _SMALLEST_SCORE else 0.0
+            min(1.0, candidate.score / _FULLY_INCLUDED_SCORE)
+            if candidate.score > _MIN_INCLUDED_SCORE
+            else 0.0
         )
-        if other.residual_ratio < _SUFFICIENT_RESIDUAL_RATIO * state.residual_ratio:
+        if other.residual_ratio < _FULLY_INCLUDED_RESIDUAL_SHARE * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
-        own = np.diag(other.fit.covariance)[LOAD_PARAMETERS]
-        squares += share * ((other.x[LOAD_PARAMETERS] - state.x[LOAD_PARAMETERS]) ** 2 + own)
+        own = np.diag(other.fit.covariance)[OFFSETS_AND_LOAD]
+        squares += share * ((other.x[OFFSETS_AND_LOAD] - state.x[OFFSETS_AND_LOAD]) ** 2 + own)
     return squares
 
 
@@ -79,7 +82,7 @@ def gain_covariance(state: State) -> Array:
     weights = rows.whitened_products(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
-    wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
+    wrench = (rows.columns == np.arange(WRENCH.start, WRENCH.stop)[:, None]) - fit.residual
     J, inverse = state.model.wrench_derivative(state.x), fit.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
@@ -98,21 +101,21 @@ def gain_covariance(state: State) -> Array:
         more = std * std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([likelihood_with_gain_std(std) for std in _GAIN_ERRORS])
-    explaining = squares.sum() > _MIN_GAIN_SHARE * state.smooth_gain[0]
-    plausible = _GAIN_ERRORS[int(likely.argmax())] < _LARGEST_GAIN_ERROR
-    if likely.max() < _MIN_GAIN_LIKELIHOOD or not explaining or not plausible:
+    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_GAIN_DEVIATIONS])
+    explaining = squares.sum() > _MIN_SHARE_EXPLAINED_BY_GAINS * state.gain_by_smooth_signals[0]
+    plausible = _TRIED_GAIN_DEVIATIONS[int(likely.argmax())] < _MAX_GAIN_DEVIATION
+    if likely.max() < _MIN_LIKELIHOOD_GAIN or not explaining or not plausible:
         return np.zeros((16, 16))
-    largest = _GAIN_ERRORS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
-    effects = largest * (inverse @ mixed)[LOAD_PARAMETERS]
+    largest = _TRIED_GAIN_DEVIATIONS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
+    effects = largest * (inverse @ mixed)[OFFSETS_AND_LOAD]
     return np.asarray(effects @ effects.T)
 
 
 def torque_unit_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
-    for other in fits_with_similar_torque_factors(state):
-        distance = other.x[LOAD_PARAMETERS] - state.x[LOAD_PARAMETERS]
+    for other in fits_with_other_torque_units(state):
+        distance = other.x[OFFSETS_AND_LOAD] - state.x[OFFSETS_AND_LOAD]
         out += np.outer(distance, distance)
     return out
 
@@ -121,29 +124,29 @@ def attenuation_bias(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
-    variance = white_noise(data.y[data.used][:, ALPHA]) ** 2
+    variance = white_noise_deviations(data.y[data.used][:, ALPHA]) ** 2
     weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
     J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
-    return np.asarray((fit.covariance @ right)[LOAD_PARAMETERS])
+    return np.asarray((fit.covariance @ right)[OFFSETS_AND_LOAD])
 
 
-def misfit_factor(state: State, blocks: Array) -> float:
+def misfit_deviation_factor(state: State, blocks: Array) -> float:
     """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
-    deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD_PARAMETERS])
+    deviations = np.sqrt(np.diag(state.fit.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
-        factor = spread / _USUAL_RESIDUAL_RATIO if spread > _TOLERATED_RESIDUAL_RATIO else 1.0
-    if "cable" in state.model.parts:
-        factor *= _CABLE_FACTOR  # a spring models a cable only to first order
+        factor = spread / _USUAL_JACKKNIFE_RATIO if spread > _TOLERATED_JACKKNIFE_RATIO else 1.0
+    if "cable" in state.model.extensions:
+        factor *= _CABLE_DEVIATION_FACTOR  # a spring models a cable only to first order
     return factor * (
-        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - _GOOD_SMOOTH_MISFIT)
+        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - GOOD_SMOOTH_MISFIT)
     )
 
 
-def block_deviations(state: State) -> Array:
+def jackknife_over_parts(state: State) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)
@@ -154,7 +157,7 @@ def block_deviations(state: State) -> Array:
         used[part] = True
         few = UsedRows(rows.data, used, rows.times, rows.columns)
         gram, pull = replace(state.fit, rows=few).normal_equations(state.model, state.x)
-        moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD_PARAMETERS])
+        moves.append((regularized_inverse(whole - gram) @ (right - pull))[OFFSETS_AND_LOAD])
     spread = np.array(moves) - np.mean(moves, axis=0)
     return np.asarray(
         np.sqrt((_NUM_JACKKNIFE_PARTS - 1.0) / _NUM_JACKKNIFE_PARTS * np.sum(spread**2, axis=0))

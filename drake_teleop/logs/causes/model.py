@@ -15,21 +15,21 @@ from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
     CONSTANT_COLUMN,
-    FORCES,
+    GRAVITY,
     MOTION_COLUMNS,
     NUM_SIGNALS,
-    PRODUCTS,
-    RATES,
-    RP,
-    TIME,
-    G,
-    R,
-    S,
+    OMEGA_PRODUCTS,
+    R_P_PRODUCTS,
+    ROTATION,
+    SPECIFIC_FORCE,
+    TIME_POLYNOMIALS,
+    WRENCH,
+    WRENCH_RATE,
 )
 
-LOAD_PARAMETERS, DELAY_PARAMETER = slice(0, 16), 16
+OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16
 """Positions of the 16 parameters [offsets; phi] and of the delay."""
-_EXTENSION_SIZES = {
+_NUM_EXTENSION_PARAMETERS = {
     "gravity": 3,
     "weight": 4,
     "torque factor": 1,
@@ -39,14 +39,14 @@ _EXTENSION_SIZES = {
     "drift": 18,
     "cable": 12,
 }
-_EXTENSION_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
+_MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
-_STEP_ROTATION_COLUMNS = slice(16, 25)
+_ROTATION_COLUMNS_OF_STEP = slice(16, 25)
 _MAX_DELAY_STEP_S = 0.03  # s, in an iteration
 _ROTATION_STEP_RAD = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
-_SYMMETRIC_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
@@ -66,28 +66,30 @@ class Model:
     """Rigid load with a selection of extensions, such as drift or a rotated sensor.
 
     Attributes:
-        parts: names of extensions, such as "gravity" or "drift".
-        gains: numbers of the wrench channels whose gain is estimated.
+        extensions: names of extensions, such as "gravity" or "drift".
+        gain_channels: numbers of the wrench channels whose gain is estimated.
         steps: changes of offsets or load.
         axes: (3, 3) signed permutation of the wrench's axes.
-        factor: given factor on the torque; the extension "torque factor" corrects it.
+        torque_factor: given factor on the torque; the extension "torque factor" corrects it.
     """
 
-    parts: tuple[str, ...] = ()
-    gains: tuple[int, ...] = ()
+    extensions: tuple[str, ...] = ()
+    gain_channels: tuple[int, ...] = ()
     steps: tuple[StepChange, ...] = ()
     axes: Array = field(default_factory=lambda: np.eye(3))
-    factor: float = 1.0
+    torque_factor: float = 1.0
 
     def with_extension(self, part: str) -> Model:
-        return self if part in self.parts else replace(self, parts=(*self.parts, part))
+        return (
+            self if part in self.extensions else replace(self, extensions=(*self.extensions, part))
+        )
 
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Position of each extension's parameters in the parameter vector."""
-        out, at = {}, DELAY_PARAMETER + 1
-        sizes = [(name, _EXTENSION_SIZES[name]) for name in self.parts]
-        sizes += [(f"gain {c}", 1) for c in self.gains]
+        out, at = {}, DELAY_INDEX + 1
+        sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
+        sizes += [(f"gain {c}", 1) for c in self.gain_channels]
         sizes += [(f"step {i}", step.size) for i, step in enumerate(self.steps)]
         for name, size in sizes:
             out[name] = slice(at, at + size)
@@ -96,26 +98,26 @@ class Model:
 
     @property
     def size(self) -> int:
-        return max([DELAY_PARAMETER + 1, *(x.stop for x in self.slices.values())])
+        return max([DELAY_INDEX + 1, *(x.stop for x in self.slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
-        wide = bool({"gravity", "cable"} & set(self.parts))
+        wide = bool({"gravity", "cable"} & set(self.extensions))
         kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
-            kept[R], kept[RP] = False, False
+            kept[ROTATION], kept[R_P_PRODUCTS] = False, False
             for i in range(len(self.steps)):
-                kept[_columns_of_step(i)][_STEP_ROTATION_COLUMNS] = False
+                kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
         return np.flatnonzero(kept)
 
     @cached_property
-    def limits(self) -> Array:
+    def max_changes(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY_PARAMETER] = _MAX_DELAY_STEP_S
+        out[DELAY_INDEX] = _MAX_DELAY_STEP_S
         for name, where in self.slices.items():
-            out[where] = _EXTENSION_LIMITS.get(
+            out[where] = _MAX_CHANGE_PER_ITERATION.get(
                 name.split(" ")[0] if "gain" in name else name, np.inf
             )
         return out
@@ -127,7 +129,7 @@ class Model:
     def start_parameters(self, x: Array, of: Model) -> Array:
         """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
         out = np.zeros(self.size)
-        out[: DELAY_PARAMETER + 1] = x[: DELAY_PARAMETER + 1]
+        out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
         for name, where in self.slices.items():
             if name in of.slices:
                 out[where] = x[of.slices[name]]
@@ -146,16 +148,16 @@ class Model:
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
-            out[..., G] += static  # - V(-g) w
+            out[..., GRAVITY] += static  # - V(-g) w
         if "cable" in parts:
             out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
         turned = self._sensor_rotations(x)
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
-        factor = np.full(len(x), self.factor)
+        factor = np.full(len(x), self.torque_factor)
         if "torque factor" in parts:
             factor = factor * (1.0 + x[:, parts["torque factor"].start])
         out[:, 3:] *= factor[:, None, None]
-        for c in self.gains:
+        for c in self.gain_channels:
             out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
         self._add_constant_extensions(out, x)
         return out
@@ -163,29 +165,33 @@ class Model:
     def _add_constant_extensions(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, CONSTANT_COLUMN] += x[:, :6]
-        out[:, channels, RATES.start + channels] += x[:, DELAY_PARAMETER, None]
+        out[:, channels, WRENCH_RATE.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
                 out[:, :, _columns_of_step(i).start] += x[:, self.slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
             if name in self.slices:
                 rows = x[:, self.slices[name]].reshape(-1, 6, degree)
-                out[:, :, TIME.start : TIME.start + degree] += rows
+                out[:, :, TIME_POLYNOMIALS.start : TIME_POLYNOMIALS.start + degree] += rows
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
-        for rows, where in ((slice(0, 3), S), (slice(3, 6), ALPHA), (slice(6, 12), PRODUCTS)):
+        for rows, where in (
+            (slice(0, 3), SPECIFIC_FORCE),
+            (slice(3, 6), ALPHA),
+            (slice(6, 12), OMEGA_PRODUCTS),
+        ):
             M[:, rows, where] = np.eye(rows.stop - rows.start)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):
-                M[:, i, R.start + 3 * i : R.start + 3 * i + 3] += d
+                M[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
             M[:, :3, ALPHA] -= cross_matrix(r)
-            M[:, :3, PRODUCTS] += centripetal_matrix(r)
+            M[:, :3, OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
 
     def _sensor_rotations(self, x: Array) -> Array:
@@ -206,7 +212,7 @@ class Model:
     def residual_coefficients(self, x: Array) -> Array:
         """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
-        out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
+        out[np.arange(6), WRENCH.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
@@ -220,9 +226,9 @@ def _load_coefficients(phi: Array) -> Array:
 
 def _cable_coefficients(x: Array) -> Array:
     out = np.zeros((len(x), 6, NUM_SIGNALS))
-    K = x[:, 3:9][:, _SYMMETRIC_INDICES]
+    K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
     for i in range(3):
-        out[:, i, R.start + 3 * i : R.start + 3 * i + 3] = x[:, :3]
-        out[:, i, RP.start + 9 * i : RP.start + 9 * i + 9] = K.reshape(-1, 9)
+        out[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = x[:, :3]
+        out[:, i, R_P_PRODUCTS.start + 9 * i : R_P_PRODUCTS.start + 9 * i + 9] = K.reshape(-1, 9)
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

@@ -9,10 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.instants import FORCES, MAX_NOISE_LAG, PRODUCTS, RP, Instants, R
+from drake_teleop.logs.causes.instants import (
+    MAX_NOISE_LAG,
+    OMEGA_PRODUCTS,
+    R_P_PRODUCTS,
+    ROTATION,
+    SYMMETRIC_ENTRIES,
+    WRENCH,
+    Instants,
+)
 from drake_teleop.logs.causes.model import Model
 
-_MIN_NOISE_ROWS = 50
+_MIN_ROWS_FOR_AUTOREGRESSION = 50
 """Fewest rows for an autoregression."""
 TimeSpans = tuple[tuple[float, float], ...]
 """(start, stop) of contacts [s]."""
@@ -27,9 +35,6 @@ class UsedRows:
     times: tuple[float, ...]
     columns: NDArray[np.intp]
 
-    def has_columns_of(self, model: Model) -> bool:
-        return self.times == model.step_times and np.array_equal(self.columns, model.columns)
-
     @cached_property
     def y(self) -> Array:
         return self.data.select_rows(self.used).append_step_signals(self.times)[:, self.columns]
@@ -37,7 +42,7 @@ class UsedRows:
     @cached_property
     def lagged_product_sums(self) -> Array:
         """Sums (5, W, W) of products of W signals at lags of 0 to 4 rows."""
-        return np.asarray(self.data.lagged_products(self.y, rows=len(self.y))[0])
+        return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def rows_with_predecessors(self) -> NDArray[np.intp]:
@@ -82,7 +87,7 @@ class UsedRows:
         )
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(self.rows_with_predecessors), 1)
-        if order == 0 or len(self.rows_with_predecessors) < _MIN_NOISE_ROWS:
+        if order == 0 or len(self.rows_with_predecessors) < _MIN_ROWS_FOR_AUTOREGRESSION:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(MAX_NOISE_LAG)
         inner += 1e-300 * np.eye(MAX_NOISE_LAG)
@@ -102,7 +107,7 @@ def is_in_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
     return inside
 
 
-_MAX_ITERATIONS, _CONVERGENCE, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
+_MAX_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
 _RIDGE, _NOISE_POWER_FLOOR = 1e-11, 1e-14
 
 
@@ -145,7 +150,7 @@ def fit_model(
 ) -> ModelFit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
-    total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
+    total = (rows.data.y[rows.used][:, WRENCH] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_NOISE_POWER_FLOOR * both, 1e-30)
     filters = np.zeros((6, MAX_NOISE_LAG + 1))
@@ -163,13 +168,13 @@ def fit_model(
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
         move = inverse @ right
-        move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
+        move /= max(1.0, float(np.max(np.abs(move) / model.max_changes)))
         x = x + move
         residual = model.residual_coefficients(x)
         order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
         found = ModelFit(model, rows, x, inverse, residual, filters, power)
-        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
+        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
         if still and step > _UNWEIGHTED_ITERATIONS:
             break
     return found
@@ -186,7 +191,6 @@ def regularized_inverse(gram: Array) -> Array:
 
 
 _NUM_SMOOTH_SEGMENTS = 6
-_STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +217,10 @@ class State:
         )
 
     def _rows_for_model(self, model: Model) -> UsedRows:
-        if self.rows.has_columns_of(model):
-            return self.rows
-        return UsedRows(self.data, self.rows.used, model.step_times, model.columns)
+        rows = self.rows
+        if rows.times == model.step_times and np.array_equal(rows.columns, model.columns):
+            return rows
+        return UsedRows(self.data, rows.used, model.step_times, model.columns)
 
     @property
     def model(self) -> Model:
@@ -243,37 +248,34 @@ class State:
         inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
         power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        count = len(self._rows_including_contacts) - len(self.rows.rows_with_predecessors)
+        every = UsedRows(self.data, self.data.used, (), self.model.columns)
+        count = len(every.rows_with_predecessors) - len(self.rows.rows_with_predecessors)
         return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
-
-    @cached_property
-    def _rows_including_contacts(self) -> Array:
-        return np.asarray(
-            UsedRows(self.data, self.data.used, (), self.model.columns).rows_with_predecessors
-        )
 
     @cached_property
     def residual_ratio(self) -> float:
         """RMS residual over white noise, in the channel where this ratio is largest."""
-        white = np.maximum(self.data.white, 1e-12)
+        white = np.maximum(self.data.wrench_noise, 1e-12)
         return float(np.max(self.rows.residual_rms(self.fit.residual) / white))
 
     @cached_property
     def smooth_misfit(self) -> float:
         """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
-        gain, freedom = self.smooth_gain
+        gain, freedom = self.gain_by_smooth_signals
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
-    def smooth_gain(self) -> tuple[float, int]:
+    def gain_by_smooth_signals(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
         part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
         columns = np.hstack(
             [
-                y[:, : PRODUCTS.stop],
-                y[:, R] if self.data.gravity_W is not None else y[:, :0],
-                y[:, RP] @ _spring_signals().T if self.data.positions else y[:, :0],
+                y[:, : OMEGA_PRODUCTS.stop],
+                y[:, ROTATION] if self.data.gravity_W is not None else y[:, :0],
+                y[:, R_P_PRODUCTS] @ _stiffness_signals().T
+                if self.data.has_positions
+                else y[:, :0],
                 part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
             ]
         )
@@ -284,7 +286,7 @@ class State:
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = likelihood_gain(x.T @ x, x.T @ white)
+            solved, rank = first_order_gain(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
 
@@ -293,12 +295,12 @@ class State:
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
         residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
-        return likelihood_gain(
+        return first_order_gain(
             *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
         )[0]
 
 
-def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
@@ -312,9 +314,9 @@ def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _spring_signals() -> Array:
+def _stiffness_signals() -> Array:
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
+    for row, (j, k) in enumerate(SYMMETRIC_ENTRIES):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0

@@ -20,7 +20,7 @@ from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Finding,
     edit_field,
-    try_edit,
+    result_for_edit_or_none,
     with_opposite_sign,
     wrench_and_motion_edits,
 )
@@ -32,23 +32,24 @@ from drake_teleop.logs.read.alignment import (
     low_pass_log,
     remove_delay,
     resample,
-    white_noise,
+    white_noise_deviations,
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-GOOD_RESIDUAL = 0.02
+GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-VALID_RESIDUAL = 0.05
+VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_CUTOFF_HZ = 15.0
-_FINDINGS_WITH_SIGN = ("sign", "swapped axes")  # mirrored axes are a cause that `identify` names
+_LOAD_FIT_CUTOFF_HZ = 15.0
+_FINDINGS_INCLUDING_SIGN = ("sign", "swapped axes")
+"""Findings with the sign; mirrored axes are a cause that `identify` names."""
 _CONTACT_FREE_SHARE = 0.75
 """Share of a record that is without contact, if any is."""
-_MAX_SAMPLES = 1500
+_MAX_FITTED_SAMPLES = 1500
 
 
 @dataclass(frozen=True)
@@ -69,18 +70,18 @@ class LoadFit:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_RESIDUAL + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     """Fit load and offsets to the best fitting share of a log, after a low-pass of 15 Hz."""
-    cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
+    cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
-    rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
+    rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))
     wrench = smooth.wrench[rows]
     scale = _channel_scales(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
-    if "weight" in log.free and smooth.gravity is not None:
+    if "weight" in log.estimated and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
         V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
     V, w = V / scale[:, None], wrench / scale
@@ -97,7 +98,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
         return LoadFit(unexplained, float(theta[0]), independent=max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
-    noise = passed * float(((white_noise(log.wrench) / scale) ** 2).sum()) / total
+    noise = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
     independent = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
     return LoadFit(unexplained, float(theta[0]), noise, independent)
 
@@ -129,14 +130,14 @@ def min_reduction_factor(fit: LoadFit) -> float:
     return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
-MIN_UNDETERMINED_SHARE = 0.9
+UNDETERMINED_UNEXPLAINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
-SMALLEST_LAG_S = 0.002
+MIN_REPORTED_LAG_S = 0.002
 """Smallest reported delay [s]."""
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
-_SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
+_MIN_DELAY_CHANGE_S, _MAX_DELAY_DEVIATION_SHARE = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_SUFFICIENT_REDUCTION = 0.5
+_MAX_UNEXPLAINED_AFTER_CORRECTION = 0.5
 
 
 def check_wrench(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
@@ -192,13 +193,18 @@ def _better_edits(
     """
     positive, negative = [], []
     for finding, edited in edits:
-        fit = try_edit(fitted, edited)
+        fit = result_for_edit_or_none(fitted, edited)
         if fit is not None and fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif fit is not None and finding is not None and finding.name not in _FINDINGS_WITH_SIGN:
+        elif (
+            fit is not None and finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN
+        ):
             negative.append((fit, *with_opposite_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid, decisive = VALID_RESIDUAL + given.noise, given.unexplained / min_reduction_factor(given)
+    valid, decisive = (
+        VALID_UNEXPLAINED + given.noise,
+        given.unexplained / min_reduction_factor(given),
+    )
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -238,13 +244,13 @@ def _findings_without_remedy(
     smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
-    finding = payload_finding(load, given.unexplained - given.noise)
+    finding = undetermined_payload_finding(load, given.unexplained - given.noise)
     if finding:
         return [finding], None
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_RESIDUAL + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.
@@ -253,9 +259,9 @@ def _findings_without_remedy(
     return lag_finding(description, delay), delay
 
 
-def payload_finding(load: Identification, unexplained: float) -> Finding | None:
+def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if a record does not determine the mass of a load."""
-    if load.verdicts[6] != "not" and unexplained < MIN_UNDETERMINED_SHARE:
+    if load.verdicts[6] != "not" and unexplained < UNDETERMINED_UNEXPLAINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
@@ -289,7 +295,7 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
+    if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
     if abs(delay) > MIN_CLOCK_ERROR_S:
@@ -328,7 +334,7 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     edited = edit_field(edited, f"{name}.time.scale", factor)
     if _unexplained_without_delay(
         data.read_thinned_log(edited)
-    ) > _SUFFICIENT_REDUCTION * _unexplained_without_delay(log):
+    ) > _MAX_UNEXPLAINED_AFTER_CORRECTION * _unexplained_without_delay(log):
         return [], description
     finding = Finding(
         "clock",
@@ -354,7 +360,11 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
     slope, late = np.polyfit(t, delays, 1)
     change = abs(slope) * span
     deviation = float(np.std(delays - late - slope * t))
-    if change < _SMALLEST_DRIFT_S or deviation > _LARGEST_DEVIATION * change or abs(slope) > 0.2:
+    if (
+        change < _MIN_DELAY_CHANGE_S
+        or deviation > _MAX_DELAY_DEVIATION_SHARE * change
+        or abs(slope) > 0.2
+    ):
         return None
     return float(late + slope * log.t[0]), float(slope)
 

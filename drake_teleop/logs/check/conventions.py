@@ -13,12 +13,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import (
-    GOOD_RESIDUAL,
+    GOOD_UNEXPLAINED,
     LoadFit,
     check_wrench,
     drift_finding,
     fit_load,
-    payload_finding,
+    undetermined_payload_finding,
     unexplained_share,
 )
 from drake_teleop.logs.check.corrections import (
@@ -29,7 +29,7 @@ from drake_teleop.logs.check.corrections import (
 )
 from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
 from drake_teleop.logs.check.log_data import LogData, channel_findings
-from drake_teleop.logs.check.pose_checks import position_finding
+from drake_teleop.logs.check.pose_checks import position_findings
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
@@ -40,9 +40,9 @@ _MIN_MOTION_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
 """Fewest poses that allow a check of the fit."""
-_MIN_DIRECTION_SPREAD = 0.15
+_MIN_GRAVITY_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_MIN_LIVE_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
+_MIN_LIVE_CHANGE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ def check_suspicious_load(
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
-    if load.mass > 0 and unexplained < GOOD_RESIDUAL and clocks and 5.0 < weight < 20.0:
+    if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
-        return tuple(_findings_without_lag(check)) if _is_suspicious(log) else ()
-    found = _findings_without_lag(check)
+        return tuple(_findings_except_lag(check)) if _is_suspicious(log) else ()
+    found = _findings_except_lag(check)
     if any(finding.name == "payload" for finding in found):
-        own = payload_finding(load, unexplained)
+        own = undetermined_payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
         if load.mass < 0 and load.identifiable[6]:
             raise DrakeTeleopError(found[-1].message, where=log.source)
@@ -118,12 +118,12 @@ def check_suspicious_load(
     return tuple(found)
 
 
-def findings_about_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
+def motion_findings(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
     """Return the findings of `check` that concern the described motion, not the wrench."""
-    return tuple(x for x in _findings_without_lag(check) if x.name in MOTION_FINDINGS)
+    return tuple(x for x in _findings_except_lag(check) if x.name in MOTION_FINDINGS)
 
 
-def _findings_without_lag(check: Callable[[], Conventions]) -> list[Finding]:
+def _findings_except_lag(check: Callable[[], Conventions]) -> list[Finding]:
     with suppress(ValueError, ArithmeticError):  # the log itself was readable
         return [finding for finding in check().findings if finding.name != "lag"]
     return []
@@ -165,7 +165,7 @@ def check_conventions(
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _MIN_LIVE_SHARE * np.abs(log.wrench).max()).all())
+    return bool((np.ptp(log.wrench, axis=0) <= _MIN_LIVE_CHANGE * np.abs(log.wrench).max()).all())
 
 
 def _check_description(data: LogData, description: Description) -> Conventions:
@@ -173,7 +173,8 @@ def _check_description(data: LogData, description: Description) -> Conventions:
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
         return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
-    if "gravity" in log.free and log.described is not None:  # determine it once, not for each edit
+    # Determine gravity once, not for each edit.
+    if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
@@ -188,15 +189,15 @@ def _check_description(data: LogData, description: Description) -> Conventions:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = fit_load(data.read_thinned_log(description))
-    if broken or (mounting is not None and mounting.mirrored):
+    if broken or (mounting is not None and mounting.is_mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
-    if "weight" in log.free:  # the checks below require the weight of the load in the wrench
+    if "weight" in log.estimated:  # the checks below require the weight of the load in the wrench
         return Conventions(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = drift_finding(description, data)
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
-        findings += position_finding(description, data, lag)
+        findings += position_findings(description, data, lag)
     more, delay = check_wrench(description, data)
     findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
     rest = _static_poses_finding(log)
@@ -236,7 +237,7 @@ def _static_poses_finding(log: Log) -> Finding | None:
         )
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
-    if least >= _MIN_DIRECTION_SPREAD:
+    if least >= _MIN_GRAVITY_DIRECTION_SPREAD:
         return None
     angle = float(np.degrees(np.arcsin(least)))
     return Finding(

@@ -14,7 +14,7 @@ from drake_teleop.common.rotations import EULER_AXES, right_angled_rotations
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-POSSIBLE_EFFECTS_OF_CAUSES = ("lag", "units", "payload")
+FINDINGS_CAUSED_BY_MISFIT = ("lag", "units", "payload")
 """Findings that may be the effect of a cause, such as drift."""
 MOTION_FINDINGS = (
     *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
@@ -52,7 +52,7 @@ def edit_field(description: Description, path: str, value: Any) -> Description:
     return description.model_copy(update={first: value})
 
 
-def _edit_with_finding(
+def _make_edit(
     description: Description, name: str, text: str, fields: dict[str, Any], note: str = ""
 ) -> Edit:
     shown = {path: str(x).lower() if isinstance(x, bool) else x for path, x in fields.items()}
@@ -80,11 +80,11 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
             if (
                 unit != sensor.unit
                 and 0.7
-                < (ratio / description.si_value(sensor.unit) * description.si_value(unit))
+                < (ratio / description.unit_in_si(sensor.unit) * description.unit_in_si(unit))
                 < 1.43
             ):
                 text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in"
-                found = _edit_with_finding(
+                found = _make_edit(
                     description, "units", f"{text} {sensor.unit}", {f"{path}.unit": unit}
                 )
                 return [found[0]], found[1]
@@ -98,9 +98,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
     if imu is not None and sensed:
         text = "the accelerometer reads g - a: gravity is reversed"
         note = " (or turn the vector `gravity` if z points down)"
-        yield _edit_with_finding(
-            description, "reversed gravity", text, {"imu.sign": -imu.sign}, note
-        )
+        yield _make_edit(description, "reversed gravity", text, {"imu.sign": -imu.sign}, note)
     where = "static.orientation" if description.static else "pose.orientation"
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
     if orientation is None:
@@ -108,23 +106,23 @@ def pose_edits(description: Description) -> Iterator[Edit]:
     if not sensed:
         turned = [0.0 - x for x in description.gravity_W.tolist()]
         text, note = "gravity is reversed", ", a vector in the world"
-        yield _edit_with_finding(description, "reversed gravity", text, {"gravity": turned}, note)
+        yield _make_edit(description, "reversed gravity", text, {"gravity": turned}, note)
     text = "the orientation is that of the world in S, R_SW, not R_WS"
     fields: dict[str, Any] = {f"{where}.inverse": not orientation.inverse}
-    yield _edit_with_finding(description, "inverted orientation", text, fields)
+    yield _make_edit(description, "inverted orientation", text, fields)
     forms = {"quaternion_wxyz": "quaternion_xyzw", "quaternion_xyzw": "quaternion_wxyz"}
     if orientation.form in forms:
         text = f"the quaternions are not {orientation.form}"
         fields = {f"{where}.form": forms[orientation.form]}
-        yield _edit_with_finding(description, "quaternion order", text, fields)
+        yield _make_edit(description, "quaternion order", text, fields)
     for axes in EULER_AXES if orientation.form == "euler" else ():
         if axes != orientation.axes:
             text = f"the Euler angles do not turn about {orientation.axes}"
-            yield _edit_with_finding(description, "Euler axes", text, {f"{where}.axes": axes})
+            yield _make_edit(description, "Euler axes", text, {f"{where}.axes": axes})
     if orientation.form in ("rotation_vector", "euler"):
         text = f"the angles are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
-        yield _edit_with_finding(description, "degrees", text, {f"{where}.unit": unit})
+        yield _make_edit(description, "degrees", text, {f"{where}.unit": unit})
 
 
 def with_opposite_sign(finding: Finding, description: Description) -> Edit:
@@ -136,7 +134,7 @@ def with_opposite_sign(finding: Finding, description: Description) -> Edit:
     return Finding(finding.name, text, finding.fields | {path: sign}), changed
 
 
-def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
+def result_for_edit_or_none(function: Callable[[Description], Any], edited: Description) -> Any:
     """Return `function(edited)`, or None if the edited description cannot be read."""
     try:
         return function(edited)
@@ -149,31 +147,31 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"
-    yield _edit_with_finding(description, "sign", text, {f"{stream}.sign": -sensor.sign})
+    yield _make_edit(description, "sign", text, {f"{stream}.sign": -sensor.sign})
     yield from pose_edits(description)
     if isinstance(sensor.frame, str):
         text, other = "the wrench is in the axes of the base", "base"
         if sensor.frame == "base":
             text, other = "the wrench is not in base axes", "sensor"
-        yield _edit_with_finding(description, "base axes", text, {f"{stream}.frame": other})
+        yield _make_edit(description, "base axes", text, {f"{stream}.frame": other})
     imu, pose = description.imu, description.pose
     if pose is not None and pose.position and (imu is None or imu.specific_force is None):
         text = f"the position is not in {pose.position.unit}"
         unit = "mm" if pose.position.unit == "m" else "m"
-        yield _edit_with_finding(description, "units", text, {"pose.position.unit": unit})
+        yield _make_edit(description, "units", text, {"pose.position.unit": unit})
     if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
         fields: dict[str, Any] = {"imu.angular_velocity.unit": "deg/s"}
-        yield _edit_with_finding(description, "degrees", "the gyroscope is in degrees", fields)
+        yield _make_edit(description, "degrees", "the gyroscope is in degrees", fields)
     columns: dict[str, Any] = {
         f"{stream}.{x}.columns": getattr(sensor, x).columns for x in ("force", "torque")
     }
     for order in list(permutations(range(3)))[1:]:
         if all(len(names) == 3 for names in columns.values()):
             fields = {path: [names[i] for i in order] for path, names in columns.items()}
-            yield _edit_with_finding(
+            yield _make_edit(
                 description, "swapped axes", "axes of the wrench are exchanged", fields
             )
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         fields = {f"{stream}.frame": (R @ old).tolist()}
-        yield _edit_with_finding(description, "swapped axes", "the wrench is in other axes", fields)
+        yield _make_edit(description, "swapped axes", "the wrench is in other axes", fields)

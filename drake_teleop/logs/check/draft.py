@@ -51,7 +51,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
         "position": (12, 13, 14),
     },
 }
-_HOMOGENEOUS_MATRIX_PLACES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
+_HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _BASE_FRAME_PATTERN = r"tcp_force$|^o_f_ext"
 _ROBOT_NOTES = {
@@ -83,9 +83,9 @@ _POSE_VECTOR_WIDTHS = (7, 8)
 _QUATERNION_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
-_MIN_RAW_COUNT = 2000.0  # median of integers that are raw counts
+_MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_TIME_FIELDS = ("column", "nanoseconds")
+_STAMP_FIELDS = ("column", "nanoseconds")
 _COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -156,12 +156,12 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     _torque_to_position(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
-    def stream_of_groups(**groups: Any) -> dict[str, Any]:
+    def stream_with_time(**groups: Any) -> dict[str, Any]:
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
     none = _UnitColumns([_FILL_IN_TEXT] * 3, "")
-    wrench = stream_of_groups(
+    wrench = stream_with_time(
         **{
             kind: _draft_quantity(table, kind, found.get(kind, none))
             for kind in ("force", "torque")
@@ -183,10 +183,10 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         if _width_of_columns(table, found.get(kind, _NO_COLUMNS)) == 3
     }
     if imu:
-        draft["imu"] = stream_of_groups(**imu)
+        draft["imu"] = stream_with_time(**imu)
     pose = _draft_pose(table, found)
     if pose:
-        draft["pose"] = stream_of_groups(**pose)
+        draft["pose"] = stream_with_time(**pose)
     if not draft:
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
@@ -195,9 +195,11 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     }
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
-    times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
+    times = {
+        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
+    }
     used |= times - {None}
-    arrays = _array_names(table)
+    arrays = _names_of_array_columns(table)
     used |= {name.partition("[")[0] for name in used}
     parts = {
         name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
@@ -234,6 +236,16 @@ def _split_name_and_unit(name: str) -> tuple[str, str]:
 
 def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
+
+
+def _group_numbered_columns(
+    plain: dict[str, tuple[str, str]], pattern: str
+) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(pattern, words):
+            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    return groups
 
 
 def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
@@ -275,10 +287,7 @@ def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[s
 
 
 def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(_POSE_VECTOR_PATTERN, words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
@@ -289,25 +298,19 @@ def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[
 
 
 def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
-    length = np.linalg.norm(table.raw_side_by_side(quaternion, ""), axis=1)
+    length = np.linalg.norm(table.numbers_with_nan_side_by_side(quaternion, ""), axis=1)
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
 
 
 def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(_NUMBERED_QUATERNION_PATTERN, words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _have_unit_length(table, group)), None)
     return {"orientation": _UnitColumns(found, "")} if found else {}
 
 
 def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups: dict[str, list[str]] = {}
-    for name, (words, _) in plain.items():
-        if re.search(r"\d$", words):
-            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    groups = _group_numbered_columns(plain, r"\d$")
     found: dict[str, _UnitColumns] = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
@@ -324,7 +327,7 @@ def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _Unit
 
 def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     found: dict[str, _UnitColumns] = {}
-    arrays = _array_names(table)
+    arrays = _names_of_array_columns(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
@@ -338,12 +341,12 @@ def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict
             if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[form] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
-        for kind, places in _HOMOGENEOUS_MATRIX_PLACES.items():
+        for kind, places in _HOMOGENEOUS_MATRIX_INDICES.items():
             found[kind] = _UnitColumns([f"{name}[{k}]" for k in places], "")
     return found
 
 
-def _array_names(table: Table) -> list[str]:
+def _names_of_array_columns(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
@@ -361,7 +364,7 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
         return group
     if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):
         return group
-    size = np.linalg.norm(np.hstack([table.raw(n, n) for n in found.columns]), axis=1)
+    size = np.linalg.norm(np.hstack([table.numbers_with_nan(n, n) for n in found.columns]), axis=1)
     if kind == "specific_force":
         return group | {"unit": "g" if np.nanmedian(size) < 3 else "m/s^2"}
     usual, other, limit = {
@@ -374,8 +377,8 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
 def _are_raw_counts(table: Table, columns: list[str]) -> bool:
     if _FILL_IN_TEXT in columns:
         return False
-    first = table.raw(columns[0], columns[0])
-    if not np.nanmedian(np.abs(first)) > _MIN_RAW_COUNT:
+    first = table.numbers_with_nan(columns[0], columns[0])
+    if not np.nanmedian(np.abs(first)) > _MIN_MEDIAN_RAW_COUNT:
         return False
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
 

@@ -6,14 +6,18 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
-from drake_teleop.logs.check.against_load import GOOD_RESIDUAL, MIN_IMPROVEMENT, VALID_RESIDUAL
+from drake_teleop.logs.check.against_load import (
+    GOOD_UNEXPLAINED,
+    MIN_IMPROVEMENT,
+    VALID_UNEXPLAINED,
+)
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
     Finding,
     edit_field,
     pose_edits,
-    try_edit,
+    result_for_edit_or_none,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
@@ -28,9 +32,9 @@ MIN_GRAVITY_ERROR = 0.02
 _SIGNIFICANT_DEVIATIONS = 5.0
 _MIN_CORRELATION = 0.8
 _COMPARISON_CUTOFF_HZ = 5.0
-_MAX_UNSWAPPED_SHARE = 0.5
-_WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
-_GYRO_AXES_RATE_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
+_MAX_UNSWAPPED_CORRELATION_SHARE = 0.5
+_WINDOW_LENGTH_RANGE_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
+_GYRO_AXES_RATE_HZ, _MIN_GRAVITY_MISFIT, _MIN_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
@@ -61,7 +65,7 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
-    given_alpha, derived_alpha = _angular_accelerations(log)
+    given_alpha, derived_alpha = _given_and_derived_alpha(log)
     sizes = float(np.linalg.norm(given_alpha)), float(np.linalg.norm(derived_alpha))
     correlation = float(np.sum(given_alpha * derived_alpha))
     if min(sizes) == 0.0 or correlation < _MIN_CORRELATION * sizes[0] * sizes[1]:
@@ -79,7 +83,7 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     return None
 
 
-def _angular_accelerations(log: Log) -> tuple[Array, Array]:
+def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
     given = low_pass(log.angular_acceleration, log.dt, _COMPARISON_CUTOFF_HZ)
     return given, low_pass(rate, log.dt, _COMPARISON_CUTOFF_HZ)
@@ -89,13 +93,13 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
-    if not given > _MIN_MISFIT:
+    if not given > _MIN_GRAVITY_MISFIT:
         return None
     best, P = min(
         ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
         key=lambda entry: entry[0],
     )
-    if _MIN_RATIO * best > given:
+    if _MIN_MISFIT_REDUCTION * best > given:
         return None
     order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -116,12 +120,12 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     if imu.angular_acceleration is None:
         return None
-    given_alpha, derived_alpha = _angular_accelerations(log)
+    given_alpha, derived_alpha = _given_and_derived_alpha(log)
     size = float(np.linalg.norm(given_alpha) * np.linalg.norm(derived_alpha)) + 1e-300
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_SHARE * largest:
+    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_CORRELATION_SHARE * largest:
         return None
     axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
@@ -137,7 +141,7 @@ def _windowed_specific_forces(log: Log, P: Array) -> Array:
 
     The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
     """
-    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
+    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_LENGTH_RANGE_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
     starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_WINDOWS)).astype(int)
@@ -201,25 +205,25 @@ def check_imu_against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > GOOD_RESIDUAL or given.mirrored or given.rotation_angle_deg > 10:
+    if given.unexplained > GOOD_UNEXPLAINED or given.is_mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
-            if (found := try_edit(fit_mounting, edited)) and not found.mirrored
+            if (found := result_for_edit_or_none(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(VALID_RESIDUAL, given.unexplained / MIN_IMPROVEMENT)
-        if given.mirrored:
+        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_IMPROVEMENT)
+        if given.is_mirrored:
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_RESIDUAL:
+        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-            limit = min(VALID_RESIDUAL, 1.5 * given.unexplained + 1e-4)
+            limit = min(VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
             findings.append(best[1])
             description, given = best[2], best[3]
-    if given.unexplained > VALID_RESIDUAL and not given.mirrored:
+    if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
         finding, description = _correct_imu_clock(description, given, data)
@@ -228,7 +232,7 @@ def check_imu_against_pose(
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
         findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
         description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
-    if given.mirrored:
+    if given.is_mirrored:
         text = (
             "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
             " has the wrong sign; correct imu.specific_force.columns"
@@ -270,7 +274,7 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
         description.wrench, description
     )
     scale = 1 / (1 + found.drift)
-    lag = scale * (found.lag_middle_s + found.drift * (start - found.middle_s))
+    lag = scale * (found.mid_record_lag_s + found.drift * (start - found.mid_record_time_s))
     offset, factor = time.offset - lag, scale * time.scale
     finding = Finding(
         "clock",

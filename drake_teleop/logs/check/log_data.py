@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.read.alignment import white_noise
-from drake_teleop.logs.read.bags import read_stream
+from drake_teleop.logs.read.alignment import white_noise_deviations
+from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_s
+from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_episodes
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
@@ -35,12 +35,11 @@ class LogData:
         self.tables = tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
-        streams = _described_streams(description)
-        for stream in streams.values():
+        for stream in description.streams.values():
             if stream.source not in tables:
-                tables[stream.source] = read_stream(stream)
+                tables[stream.source] = read_stream_table(stream)
             steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
-        for name, stream in streams.items():
+        for name, stream in description.streams.items():
             thin = self._thinned.setdefault(
                 stream.source,
                 replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
@@ -53,7 +52,7 @@ class LogData:
     def read_thinned_log(self, description: Description) -> Log:
         """Return the log at about 100 Hz, as a description defines it."""
         stamped = {}
-        for name, stream in _described_streams(description).items():
+        for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
                 column = {"column": f"{_TIME_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
@@ -86,7 +85,7 @@ class LogData:
         if stream.time.column is None:
             rows = np.arange(self._table_of_stream(stream).rows)
             return rows / stream.time.rate, rows
-        t, _ = time_stamps_s(stream.time, self._table_of_stream(stream), "time")
+        t, _ = time_stamps_and_episodes(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)
@@ -101,17 +100,12 @@ class LogData:
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
-                x = table.raw(column, field)
+                x = table.numbers_with_nan(column, field)
                 x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
                 thin.columns[column] = (
                     taken if field == "orientation" else _means_of_consecutive_rows(x, k)
                 )
-
-
-def _described_streams(description: Description) -> dict[str, Any]:
-    streams = {name: getattr(description, name) for name in ("wrench", "imu", "pose", "static")}
-    return {name: stream for name, stream in streams.items() if stream is not None}
 
 
 def _means_of_consecutive_rows(x: Array, k: int) -> Array:
@@ -123,7 +117,7 @@ _CHECKED_FIELDS = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
-_MIN_NOISE_SHARE = 1e-6
+_MIN_LIVE_NOISE_SHARE = 1e-6
 
 
 def channel_findings(
@@ -138,7 +132,7 @@ def channel_findings(
         if quantity is None:
             continue
         where = f"{stream}.{field}"
-        numbers = _channel_values(tables[described.source], quantity.columns, where)
+        numbers = _values_by_channel(tables[described.source], quantity.columns, where)
         twice = _repeated_column_findings(where, quantity.columns, named)
         found += twice or [
             *_dead_channel_findings(where, numbers),
@@ -147,10 +141,10 @@ def channel_findings(
     return found
 
 
-def _channel_values(table: Table, columns: Any, where: str) -> dict[str, Array]:
+def _values_by_channel(table: Table, columns: Any, where: str) -> dict[str, Array]:
     numbers: dict[str, Array] = {}
     for column in columns:
-        x = table.raw(column, where)
+        x = table.numbers_with_nan(column, where)
         for i, values in enumerate(x.T):
             numbers[str(column) if len(x.T) == 1 else f"{column}[{i}]"] = values
     return numbers
@@ -175,8 +169,8 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
 
 def _dead_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
-    noise = white_noise(np.stack(list(numbers.values()), axis=1))
-    alive = noise > _MIN_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
+    noise = white_noise_deviations(np.stack(list(numbers.values()), axis=1))
+    alive = noise > _MIN_LIVE_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
+from drake_teleop.logs.read.auto_frames import round_for_yaml
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
@@ -22,15 +23,15 @@ if TYPE_CHECKING:
 
 _CUTOFF_HZ = 3.0
 _MAX_CONDITION_NUMBER = 1e8
-_SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
+_MIN_REPORTED_SHIFT_M, _MAX_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _SIGNIFICANT_DEVIATIONS = 5.0  # standard deviations
-_UNIT_RANGE, _MAX_UNIT_DEVIATION = (0.7, 1.43), 0.15
+_UNIT_RATIO_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 MIN_POSES_DURATION_S = 4.0
 """Shorter records have too few frequencies for an estimate by poses alone [s]."""
-_UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
+_MAX_SCALE_ERROR_FOR_FRAME, _MIN_COM_DISTANCE_M, _MAX_COM_DISTANCE_M = 0.1, 2e-4, 1.5  # 1, m, m
 _TORQUE_UNITS = ("N m", "N mm", "lbf in")
-_UNIT_RATIOS = (
+_WRONG_TORQUE_UNIT_RATIOS = (
     *(
         SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
         for unit, other in permutations(_TORQUE_UNITS, 2)
@@ -41,7 +42,7 @@ _UNIT_RATIOS = (
 _COM_TOLERANCE = 0.03
 
 
-def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
+def position_findings(description: Description, data: LogData, lag: float) -> list[Finding]:
     """Return findings for positions in a wrong unit, or of a point other than So.
 
     They are compared with the accelerometer, whose clock lags the pose's by `lag` [s].
@@ -66,7 +67,9 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
     columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
-    fit = _fit_with_offset(columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0]))
+    fit = _fit_centred_signals(
+        columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0])
+    )
     if fit is None or abs(fit[0][0]) <= _SIGNIFICANT_DEVIATIONS * fit[1][0]:
         return []
     x, deviations = fit
@@ -76,9 +79,9 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
         return [unit]
     shift, deviation = x[1:] / k, float(np.linalg.norm(deviations[1:]))
     size = float(np.linalg.norm(shift))
-    if abs(k - 1.0) > _MAX_UNIT_DEVIATION or deviation > _LARGEST_DEVIATION:
+    if abs(k - 1.0) > _MAX_SCALE_ERROR_FOR_SHIFT or deviation > _MAX_SHIFT_DEVIATION_M:
         return []
-    if size < max(_SMALLEST_SHIFT, _SIGNIFICANT_DEVIATIONS * deviation):
+    if size < max(_MIN_REPORTED_SHIFT_M, _SIGNIFICANT_DEVIATIONS * deviation):
         return []
     place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
     text = (
@@ -95,7 +98,7 @@ def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding 
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
-        if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
+        if unit != now and _UNIT_RATIO_RANGE[0] < kappa / ratio < _UNIT_RATIO_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
@@ -106,7 +109,7 @@ def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding 
     )
 
 
-def _fit_with_offset(
+def _fit_centred_signals(
     columns: Array, target: Array, independent: float
 ) -> tuple[Array, Array] | None:
     if len(columns) == 0:
@@ -134,7 +137,7 @@ def has_usable_poses(log: Log) -> bool:
     )
 
 
-def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
+def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
     """Return a finding for positions in a wrong unit, or for a pose frame that is not S."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
@@ -145,21 +148,21 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
         )
         if unit is not None:
             return unit
-    return frame_finding(found, log.posed)
+    return pose_frame_finding(found, log.posed)
 
 
-def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
+def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
     """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
     frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.state.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
     unit = abs(seen.position_unit_ratio - 1.0) > max(
-        _UNIT_TOLERANCE, 5.0 * seen.position_unit_deviation
+        _MAX_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_deviation
     )
     if (
         unit
         or (seen.is_usable and seen.is_mirrored)
-        or _is_torque_unit_wrong(phi[1:4] / phi[0], frame.p_SoPo_S)
+        or _may_torque_unit_be_wrong(phi[1:4] / phi[0], frame.p_SoPo_S)
     ):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
@@ -170,23 +173,21 @@ def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
         texts.append(
             f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
         )
-        lines.append(f"pose.position_in_sensor: {_rounded_for_yaml(place)}")
+        lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.is_rotated:
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
         deviation = float(frame.rotation_deviations_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
-        lines.append(f"pose.rotation_in_sensor: {_rounded_for_yaml(frame.R_SP @ posed.R_SP)}")
+        lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
     return Finding(
         "pose frame",
         f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
     )
 
 
-def _is_torque_unit_wrong(com: Array, shift: Array) -> bool:
+def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
-    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _UNIT_RATIOS]
-    return not _NEAREST_COM < size < _FARTHEST_COM or bool(min(off) < _COM_TOLERANCE * size)
-
-
-def _rounded_for_yaml(x: Array) -> list[Any]:
-    return list((np.round(x, 4) + 0.0).tolist())
+    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS]
+    return not _MIN_COM_DISTANCE_M < size < _MAX_COM_DISTANCE_M or bool(
+        min(off) < _COM_TOLERANCE * size
+    )

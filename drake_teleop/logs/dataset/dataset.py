@@ -39,7 +39,7 @@ from drake_teleop.logs.dataset.dataset_files import (
     open_dataset,
     write_copy,
 )
-from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
@@ -67,11 +67,8 @@ _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_FRAMES = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
-_CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES = (
-    2,
-    20,
-)  # frames around contact; free frames for the offsets
+_MAX_EXCESS_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
@@ -257,7 +254,7 @@ def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tu
         )
     assert described.wrench is not None
     clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
-    at = np.interp(np.arange(clock.total), clock.rows, clock.t - clock.t[0])
+    at = np.interp(np.arange(clock.num_rows), clock.kept_rows, clock.t - clock.t[0])
     return log, at
 
 
@@ -335,10 +332,12 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
     log, at = _read_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
     predict = signals.reading_predictor(shared.phi)
-    found = find_hypothesis(predict, signals.regressor_at_lag, shared.lag, shared.typical)
+    found = find_hypothesis(
+        predict, signals.regressor_at_lag, shared.lag_frames, shared.usual_half_widths
+    )
     residual = unexplained_reading(found, predict, signals.regressor_at_lag)
-    faults: list[EpisodeFault] = saturated_channels(log.wrench)
-    faults += name_faults(found, shared.lag, shared.phi, 1.0 / log.dt)
+    faults: list[EpisodeFault] = saturation_faults(log.wrench)
+    faults += name_faults(found, shared.lag_frames, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
     if step is not None:
@@ -347,11 +346,11 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
-    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(
-        shared.typical
-    )
+    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * shared.usual_half_widths)[
+        0
+    ] - np.log(shared.usual_half_widths)
     spread -= np.log(found.gain).repeat(3)
-    if not faults and spread.mean() > _MAX_EXCESS_SPREAD:
+    if not faults and spread.mean() > _MAX_EXCESS_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
@@ -378,10 +377,10 @@ def _contact_wrench_and_flags(
 ) -> tuple[Array, NDArray[np.bool_]]:
     for _ in range(3):
         contact = found.wrench_of_reading(residual)
-        detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
+        detector = ContactDetector(shared.noise_floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
         free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
-        if free.sum() < _MIN_FREE_FRAMES:
+        if free.sum() < _MIN_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)
     return contact, touched
@@ -399,8 +398,8 @@ def _dataset_summary(
         "frames": sum(row["frames"] for row in rows),
         "ok": names["ok"],
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
-        "lag_frames": shared.lag,
-        "noise": shared.typical / HALF_WIDTH_OF_NORMAL,
+        "lag_frames": shared.lag_frames,
+        "noise": shared.usual_half_widths / HALF_WIDTH_OF_NORMAL,
         "contact_threshold": shared.threshold,
         **summarize_load(shared.identification),
     }

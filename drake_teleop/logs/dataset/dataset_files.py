@@ -9,7 +9,7 @@ import copy
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
-from drake_teleop.common.files import make_folder, whole_file, write_table
+from drake_teleop.common.files import make_folder, whole_file, write_table, write_text
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import (
-    columns_with_nested,
+    numeric_and_nested_columns,
     numeric_column_names,
     read_table,
 )
@@ -33,7 +33,7 @@ from drake_teleop.logs.read.tables import Table
 CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
 _TABLE_SUFFIXES = (".csv", ".tsv", ".parquet")
 _ZARR_METADATA_NAMES = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
-_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_LEROBOT_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 class Episode(NamedTuple):
@@ -76,7 +76,7 @@ class Dataset(NamedTuple):
                 return Table(episode.file, _with_element_columns(arrays))
             frame = _numeric_frame(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first, episode.rows)
-            return Table(episode.file, columns_with_nested(part))
+            return Table(episode.file, numeric_and_nested_columns(part))
 
 
 @lru_cache(maxsize=1)
@@ -169,11 +169,13 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> No
     for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
         if file not in written:
             copied = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
-            _link_or_copy_file(file, out / file.relative_to(dataset.path), copied=copied)
+            _hard_link_or_copy(file, out / file.relative_to(dataset.path), copied=copied)
     if dataset.kind == "zarr":
         _write_zarr(out, columns)
         return
-    for path, part in _columns_by_file(dataset.episodes, columns):
+    for path in dict.fromkeys(episode.file for episode in dataset.episodes):
+        pairs = zip(dataset.episodes, columns, strict=True)
+        part = _join_columns([new for episode, new in pairs if episode.file == path])
         target = out / path.relative_to(dataset.path)
         make_folder(target.parent)
         if path.suffix.lower() == ".parquet":
@@ -184,22 +186,11 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> No
         _write_lerobot_metadata(dataset.path / "meta", out / "meta", columns)
 
 
-def _columns_by_file(
-    episodes: Sequence[Episode], columns: Sequence[NewColumns]
-) -> Iterator[tuple[Path, NewColumns]]:
-    files = list(dict.fromkeys(episode.file for episode in episodes))
-    for file in files:
-        yield (
-            file,
-            _join_columns([c for e, c in zip(episodes, columns, strict=True) if e.file == file]),
-        )
-
-
 def _join_columns(columns: Sequence[NewColumns]) -> NewColumns:
     return NewColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
-def _link_or_copy_file(file: Path, target: Path, *, copied: bool) -> None:
+def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
     make_folder(target.parent)
     with whole_file(target) as temporary:
         temporary.unlink(missing_ok=True)
@@ -295,7 +286,7 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
     }
     info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
-    _write_json(target / "info.json", info)
+    write_text(target / "info.json", json.dumps(info, indent=4, ensure_ascii=False))
     if not (source / "stats.json").is_file():
         return
     stats, new = (
@@ -310,11 +301,6 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
         x = values.astype(float)
         parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
         if with_quantiles:
-            parts |= {key: np.quantile(x, q, axis=0) for key, q in _QUANTILES.items()}
+            parts |= {key: np.quantile(x, q, axis=0) for key, q in _LEROBOT_QUANTILES.items()}
         stats[name] = {key: y.tolist() for key, y in parts.items()} | {"count": [len(x)]}
-    _write_json(target / "stats.json", stats)
-
-
-def _write_json(path: Path, data: Any) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_text(target / "stats.json", json.dumps(stats, indent=4, ensure_ascii=False))

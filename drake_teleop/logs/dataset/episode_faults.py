@@ -15,7 +15,7 @@ _UNITS_OF_QUANTITIES = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
-_UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
+_UNIT_FACTOR_TOLERANCE, _MIN_GAIN_ERROR = 0.04, 0.06
 _MIN_ROTATION_DEG = 4.0
 _MIN_LAG_FRAMES = 0.6  # frames
 _MIN_SATURATED_FRAMES = 4
@@ -44,12 +44,12 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
-    found += _rotation_findings(
-        x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
+    found += _rotation_faults(
+        x.force_axes, "the wrench" if np.allclose(x.force_axes, x.torque_axes) else "the force"
     )
-    if not np.allclose(x.force, x.torque):
-        found += _rotation_findings(x.torque, "the torque")
-    found += _unit_findings(x.gain)
+    if not np.allclose(x.force_axes, x.torque_axes):
+        found += _rotation_faults(x.torque_axes, "the torque")
+    found += _unit_faults(x.gain)
     late = x.lag - usual_lag
     if abs(late) >= _MIN_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"
@@ -58,7 +58,7 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     return found
 
 
-def _rotation_findings(M: Array, what: str) -> list[EpisodeFault]:
+def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
     from scipy.spatial.transform import Rotation
 
     single = np.flatnonzero(np.diag(M) < 0)
@@ -78,19 +78,19 @@ def _rotation_findings(M: Array, what: str) -> list[EpisodeFault]:
     return found
 
 
-def _unit_findings(gain: Array) -> list[EpisodeFault]:
+def _unit_faults(gain: Array) -> list[EpisodeFault]:
     found = []
     for factor, (what, si, names) in zip(gain, _UNITS_OF_QUANTITIES, strict=True):
-        if abs(factor - 1.0) < _SMALLEST_GAIN:
+        if abs(factor - 1.0) < _MIN_GAIN_ERROR:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
-        near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_TOLERANCE
+        near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_FACTOR_TOLERANCE
         text = f"the {what} is {factor:.4g} times that in {si}"
         found.append(EpisodeFault("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
 
 
-def saturated_channels(wrench: Array) -> list[EpisodeFault]:
+def saturation_faults(wrench: Array) -> list[EpisodeFault]:
     """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):

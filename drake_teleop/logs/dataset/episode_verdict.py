@@ -31,16 +31,14 @@ HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
 _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
-_BEST_ROWS_SHARE, _ITERATIONS = 0.6, 4
-_COST_PER_DEVIATION, _COST_FRAMES = (
-    0.25,
-    40.0,
-)  # required reduction of the log spread, for each deviation
+_REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
+# Required reduction of the log spread, for each deviation.
+_COST_PER_DEVIATION, _COST_TIMES_FRAMES = 0.25, 40.0
 _NUM_START_PARTS = 4
-_MIN_SPREAD_SHARE = 0.3
+_MIN_HALF_WIDTH_SHARE = 0.3
 _INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
-_FEWEST_STEP_FRAMES, _STEP_SHARE, _NUM_TRIED_STEPS = 12, 0.12, 20
-_NOISE_MARGIN = 1.5
+_MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
+_MAX_DEVIATION_OVER_NOISE = 1.5
 
 PredictReading = Callable[[str, float], tuple[Array, Array]]
 """Function of a kind and a lag [frames]: reading in the axes of S, and the load's wrench (N, 6)."""
@@ -55,7 +53,7 @@ class Hypothesis:
     Attributes:
         kind: one of `HYPOTHESIS_KINDS`.
         lag: delay of the motion behind the wrench [frames].
-        force, torque: (3, 3) rotation or mirroring of the load's force and torque.
+        force_axes, torque_axes: (3, 3) rotation or mirroring of the load's force and torque.
         gain: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
         spread: (6,) logarithms of the half widths of the residual.
@@ -65,8 +63,8 @@ class Hypothesis:
 
     kind: str
     lag: float
-    force: Array
-    torque: Array
+    force_axes: Array
+    torque_axes: Array
     gain: Array
     phi: Array | None = None
     spread: Array = field(default_factory=lambda: np.zeros(6))
@@ -76,11 +74,13 @@ class Hypothesis:
     def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
-        return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
+        return np.hstack(
+            [self.gain[0] * f @ self.force_axes.T, self.gain[1] * tau @ self.torque_axes.T]
+        )
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
-        f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
+        f, tau = wrench[:, :3] @ self.force_axes, wrench[:, 3:] @ self.torque_axes
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 
 
@@ -103,7 +103,7 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _MIN_SPREAD_SHARE * typical)
+    search = HypothesisSearch(predict, regress, usual_lag, _MIN_HALF_WIDTH_SHARE * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
@@ -140,7 +140,7 @@ class HypothesisSearch:
         self.predict, self.regress = predict, regress
         self.usual_lag, self.floor = usual_lag, floor
         self.frames = len(predict("sensor", usual_lag)[0])
-        self.price = _COST_PER_DEVIATION + _COST_FRAMES / self.frames
+        self.price = _COST_PER_DEVIATION + _COST_TIMES_FRAMES / self.frames
 
     def _reading_residual(self, x: Hypothesis) -> Array:
         return unexplained_reading(x, self.predict, self.regress)
@@ -160,17 +160,19 @@ class HypothesisSearch:
         force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
-        yield self.with_spread_and_cost(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
+        yield self.with_spread_and_cost(
+            replace(plain, force_axes=-np.eye(3), torque_axes=-np.eye(3))
+        )
         for M, T in ((force, force), (torque, torque), (force, torque)):
-            yield self.with_spread_and_cost(replace(plain, force=M, torque=T))
+            yield self.with_spread_and_cost(replace(plain, force_axes=M, torque_axes=T))
         for det in (1.0, -1.0):
             start = self.refit_to_best_rows(plain, det=det, scale=True)
             yield start
             yield self.refit_to_best_rows(replace(start, gain=one), det=det, scale=False)
-            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force).sum()))
+            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
             for M in (np.eye(3), -np.eye(3), nearest):
                 yield self.refit_to_best_rows(
-                    replace(start, force=M, torque=M), det=0.0, scale=True
+                    replace(start, force_axes=M, torque_axes=M), det=0.0, scale=True
                 )
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
@@ -205,7 +207,7 @@ class HypothesisSearch:
         self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
     ) -> Hypothesis:
         both = self.predict(x.kind, x.lag)
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_REFITS):
             w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
             if scale:
                 ratio = [
@@ -215,7 +217,7 @@ class HypothesisSearch:
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
                 M = _fit_rotation(w, q, x.gain, det)
-                x = replace(x, force=M, torque=M)
+                x = replace(x, force_axes=M, torque_axes=M)
             if scale:
                 x = replace(x, gain=_fit_gains(w, q, x))
             x = self.with_spread_and_cost(x)
@@ -233,7 +235,7 @@ class HypothesisSearch:
     ) -> Hypothesis:
         x = hypothesis_without_fault(lag)
         weights = np.exp(-spread_and_centre_of_calm_half(wrench, self.floor)[0])
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_REFITS):
             w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
             A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
             size = np.linalg.norm(A, axis=0) + 1e-12
@@ -274,7 +276,7 @@ class HypothesisSearch:
 
 def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
     distance = (residual**2).sum(axis=1)
-    return np.asarray(distance <= np.quantile(distance, _BEST_ROWS_SHARE))
+    return np.asarray(distance <= np.quantile(distance, _REFITTED_ROWS_SHARE))
 
 
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
@@ -289,7 +291,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE, x.force), (_TORQUE, x.torque)):
+    for channels, M in ((_FORCE, x.force_axes), (_TORQUE, x.torque_axes)):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
@@ -299,7 +301,7 @@ def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _rotation_cost(x.force) + float(not np.allclose(x.force, x.torque))
+    count += _rotation_cost(x.force_axes) + float(not np.allclose(x.force_axes, x.torque_axes))
     scaled = x.gain != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 
@@ -320,8 +322,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (
         np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL
     )
-    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _NOISE_MARGIN * noise)
-    fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
+    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_DEVIATION_OVER_NOISE * noise)
+    fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
         centre = spread_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
@@ -330,7 +332,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     whole = inliers_and_centre(residual)[0].sum()
     best: tuple[int, int, Array, Array] | None = None
     jumps = np.linalg.norm(np.diff(residual, axis=0) / deviation, axis=1)
-    for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEPS]:
+    for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEP_FRAMES]:
         if not fewest <= k <= n - fewest:
             continue
         (first, before), (second, after) = (

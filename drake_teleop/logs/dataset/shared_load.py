@@ -27,13 +27,11 @@ from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
-_LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
-_LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
-_FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = (
-    5.0,
-    2,
-)  # of a frame without contact; frames around contact
-_THRESHOLD_MARGIN = 1.1  # over the largest level of free frames
+# Log spread beyond that of an episode's own load.
+_MAX_COUNTED_EXCESS, _MAX_MEMBER_EXCESS = 6.0, 2.0
+_LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0  # frames
+_FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
+_THRESHOLD_OVER_LARGEST_LEVEL = 1.1  # over the largest level of free frames
 
 
 @dataclass(frozen=True)
@@ -42,16 +40,16 @@ class SharedLoad:
 
     Attributes:
         phi: (10,) load that is removed.
-        lag: usual delay of the motion behind the wrench [frames].
-        typical: (6,) usual half widths of the residual [N, N m].
-        floor, threshold: noise floor and threshold of contact detection.
+        lag_frames: usual delay of the motion behind the wrench [frames].
+        usual_half_widths: (6,) usual half widths of the residual [N, N m].
+        noise_floor, threshold: noise floor and threshold of contact detection.
     """
 
     identification: Identification
     phi: Array
-    lag: float
-    typical: Array
-    floor: NoiseFloor
+    lag_frames: float
+    usual_half_widths: Array
+    noise_floor: NoiseFloor
     threshold: float
 
 
@@ -72,10 +70,12 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
             )
         phi = min(
             candidates,
-            key=lambda phi: _excess_spread(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum(),
+            key=lambda phi: (
+                _excess_log_spread(episodes, own, phi).clip(max=_MAX_COUNTED_EXCESS).sum()
+            ),
         )
         for _ in range(2):
-            members = _excess_spread(episodes, own, phi) < _MEMBER_EXCESS
+            members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS
             members = members if members.any() else np.ones(len(own), bool)
             load = _fit_load_to_members(episodes, own, members, phi)
             phi = load.phi
@@ -83,7 +83,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else usable_phi(load)[0]
-    members = _excess_spread(episodes, own, phi) < _MEMBER_EXCESS
+    members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
     usual = [_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
     lag = (
@@ -96,7 +96,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
-    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_MARGIN * float(floor.reached[0]))
+    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.reached[0]))
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 
@@ -108,13 +108,13 @@ def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
         0.0,
         _MIN_RESIDUAL_HALF_WIDTH,
     )
-    lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
+    lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     return min(
         (search.hypothesis_of_other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum()
     )
 
 
-def _excess_spread(
+def _excess_log_spread(
     episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
 ) -> Array:
     usual = [

@@ -97,7 +97,7 @@ class PosesOfLog:
     R_SP: Array = field(default_factory=lambda: np.eye(3))
     imu: ImuData | None = None
 
-    def with_times_from(self, start: float) -> PosesOfLog:
+    def with_times_relative_to(self, start: float) -> PosesOfLog:
         """Return poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

@@ -17,7 +17,7 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_ALIGNED_SAMPLES = 8
-_CHUNK_ROWS = 2**18
+_INTERPOLATED_CHUNK_ROWS = 2**18
 _MIN_WINDOW_SAMPLES = 9
 _POLYNOMIAL_DEGREE = 5
 SMOOTHER_WINDOW_OVER_PERIOD = 1.8
@@ -43,13 +43,13 @@ def resample(t_new: Array, t: Array, x: Array) -> Array:
     if np.array_equal(t_new, t[first : first + len(t_new)]):
         return x[first : first + len(t_new)]
     out = np.empty((len(t_new), *x.shape[1:]))
-    for start in range(0, len(t_new), _CHUNK_ROWS):  # limits the memory of temporaries
-        part = slice(start, start + _CHUNK_ROWS)
-        out[part] = _interpolate(t_new[part], t, x)
+    for start in range(0, len(t_new), _INTERPOLATED_CHUNK_ROWS):  # limits the memory of temporaries
+        part = slice(start, start + _INTERPOLATED_CHUNK_ROWS)
+        out[part] = _interpolate_linearly(t_new[part], t, x)
     return out
 
 
-def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
+def _interpolate_linearly(t_new: Array, t: Array, x: Array) -> Array:
     # A single search for all columns is faster than np.interp for each.
     before = np.searchsorted(t[1:-1], t_new, side="right")
     start, end = t[before], t[before + 1]
@@ -89,7 +89,7 @@ def smooth_derivatives(
     Filter of Savitzky and Golay (1964), window 1.8 / `bandwidth_hz` [s], at least 9 samples.
     """
     n = len(x)
-    weights = smoother_weights(n, dt, bandwidth_hz)
+    weights = polynomial_fit_weights(n, dt, bandwidth_hz)
     half = weights.shape[1] // 2
     flat = x.reshape(n, -1)
     inner = [
@@ -99,8 +99,8 @@ def smooth_derivatives(
     tau = dt * np.arange(1, half + 1)
     derivatives = []
     for order in range(3):
-        before = _differentiate_polynomials([c[0] for c in inner], -tau[::-1], order)
-        after = _differentiate_polynomials([c[-1] for c in inner], tau, order)
+        before = _evaluate_polynomial_derivatives([c[0] for c in inner], -tau[::-1], order)
+        after = _evaluate_polynomial_derivatives([c[-1] for c in inner], tau, order)
         middle = math.factorial(order) * inner[order]
         derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
     return derivatives[0], derivatives[1], derivatives[2]
@@ -108,11 +108,11 @@ def smooth_derivatives(
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
     """Return noise (3,) of `smooth_derivatives` over white noise of x: [1], [1/s], [1/s^2]."""
-    weights = smoother_weights(10**9, dt, bandwidth_hz)
+    weights = polynomial_fit_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
-def smoother_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
+def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
     """Return weights (6, w) that map w <= n samples to the coefficients of their polynomial."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
@@ -121,7 +121,7 @@ def smoother_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
     return np.linalg.pinv(powers) / (half * dt) ** np.arange(_POLYNOMIAL_DEGREE + 1)[:, None]
 
 
-def _differentiate_polynomials(coefficients: list[Array], tau: Array, order: int) -> Array:
+def _evaluate_polynomial_derivatives(coefficients: list[Array], tau: Array, order: int) -> Array:
     terms = [
         math.perm(power, order) * np.outer(tau ** (power - order), c)
         for power, c in enumerate(coefficients)
@@ -144,7 +144,7 @@ def vectors_of_skew_parts(A: Array) -> Array:
     )
 
 
-def white_noise(x: Array) -> Array:
+def white_noise_deviations(x: Array) -> Array:
     """Return standard deviations (k,) of white noise in x (N, k), from third differences."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
@@ -227,8 +227,8 @@ def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 DELAY_SEARCH_RANGE_S = 0.25
-_MAX_DELAY_SAMPLES = 5000
-_MIN_DELAY_SAMPLES = 32
+_MAX_SAMPLES_FOR_DELAY = 5000
+_MIN_SAMPLES_FOR_DELAY = 32
 
 
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
@@ -245,9 +245,9 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     gap = ~far_from_gaps(log, cutoff)
     gap = widen_flags(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
-    if len(inside) < _MIN_DELAY_SAMPLES:
+    if len(inside) < _MIN_SAMPLES_FOR_DELAY:
         return None
-    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_DELAY_SAMPLES)
+    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES_FOR_DELAY)
     cost = _cost_of_shift(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])

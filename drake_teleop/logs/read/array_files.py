@@ -19,10 +19,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 
-_MAX_VALUES, _MAX_NUMBERS_PER_ROW = (
-    2**28,
-    64,
-)  # numbers of an array, and of one row: wider ones are images
+_MAX_ARRAY_NUMBERS, _MAX_NUMBERS_PER_ROW = 2**28, 64  # arrays with wider rows are images
 
 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
@@ -66,8 +63,10 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
         or math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW
     ):
         return False
-    if math.prod(shape) > _MAX_VALUES:
-        raise ValueError(f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_VALUES:.2g})")
+    if math.prod(shape) > _MAX_ARRAY_NUMBERS:
+        raise ValueError(
+            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_ARRAY_NUMBERS:.2g})"
+        )
     return True
 
 
@@ -82,21 +81,19 @@ def import_optional_module(name: str, path: Path) -> Any:
         ) from None
 
 
-_MAT_HEADER_BYTES, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = (
-    128,
-    14,
-    15,
-    2,
-    1 << 11,
-    20,
-)
+_MAT_HEADER_BYTES = 128
+_MATRIX_TYPE = 14
+_COMPRESSED_TYPE = 15
+_STRUCTURE_CLASS = 2
+_COMPLEX_FLAG = 1 << 11
+_MAX_STRUCTURE_DEPTH = 20
 _MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
-_MAT_NUMBER_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
+_DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
     13: "u8",
 }
-_FLAGS_AND_SIZE = [6, 5]
+_FLAGS_AND_SIZE_TYPES = [6, 5]
 _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 
@@ -113,8 +110,8 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     elif version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
-        for kind, content in _iterate_elements(memoryview(data)[_MAT_HEADER_BYTES:], order):
-            _add_variable(kind, content, order, None, 0, found)
+        for kind, content in _iterate_mat_elements(memoryview(data)[_MAT_HEADER_BYTES:], order):
+            _add_mat_variable(kind, content, order, None, 0, found)
     else:
         for name, value in loadmat(path).items():
             if isinstance(value, np.ndarray):
@@ -124,7 +121,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     return found
 
 
-def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+def _iterate_mat_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     start = 0
     while start < len(data):
         if len(data) - start < 8:
@@ -135,41 +132,42 @@ def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memor
         content = data[start + begin : start + begin + size]
         if len(content) < size or (small and size > 4):
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        if kind == _COMPRESSED:
-            yield from _iterate_elements(memoryview(zlib.decompress(content)), order)
+        if kind == _COMPRESSED_TYPE:
+            yield from _iterate_mat_elements(memoryview(zlib.decompress(content)), order)
         else:
             yield kind, content
-        start += 8 if small else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        start += 8 if small else 8 + (size if kind == _COMPRESSED_TYPE else -(-size // 8) * 8)
 
 
-def _add_variable(
+def _add_mat_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    parts = list(_iterate_elements(content, order)) if kind == _MATRIX else []
-    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
+    parts = list(_iterate_mat_elements(content, order)) if kind == _MATRIX_TYPE else []
+    # Objects have no size.
+    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE_TYPES:
         return
-    if depth > _MAX_DEPTH:
+    if depth > _MAX_STRUCTURE_DEPTH:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
-    (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
+    (flags, *_), size = (_parse_mat_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _COMPLEX:
+    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)
-    elif flags & 0xFF == _STRUCTURE and math.prod(size) == 1 and len(parts) > 4:
-        (length, *_), names = _parse_numbers(parts[3], order).tolist(), bytes(parts[4][1])
+        _add_array(name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found)
+    elif flags & 0xFF == _STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
+        (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
         for field, part in zip(fields, parts[5:], strict=True):
             label = field.partition(b"\0")[0].decode("latin-1")
-            _add_variable(*part, order, f"{name}.{label}", depth + 1, found)
+            _add_mat_variable(*part, order, f"{name}.{label}", depth + 1, found)
 
 
-def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
+def _parse_mat_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
-    if kind not in _MAT_NUMBER_TYPES:
+    if kind not in _DTYPE_OF_MAT_TYPE:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
-    return np.frombuffer(content, f"{order}{_MAT_NUMBER_TYPES[kind]}").astype(
-        _MAT_NUMBER_TYPES[kind]
+    return np.frombuffer(content, f"{order}{_DTYPE_OF_MAT_TYPE[kind]}").astype(
+        _DTYPE_OF_MAT_TYPE[kind]
     )
 
 

@@ -18,7 +18,7 @@ from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
-MAX_LAG_S = 0.05
+MIN_LAG_OF_WARNING_S = 0.05
 """Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
@@ -42,25 +42,25 @@ def estimate_auto_imu_mounting(
         at_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
         mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
     if frame == "auto":
-        found = _require_rotation(mounting, f"{source}:imu.frame")
+        found = _require_imu_rotation(mounting, f"{source}:imu.frame")
         frame = tuple(map(tuple, found.R_SI.tolist()))
-        notes += _rotation_notes(found)
+        notes += _imu_rotation_notes(found)
     if position == "auto":
         at_Io = read(replace_imu_fields(frame=frame, position=(0.0, 0.0, 0.0)))
-        lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
+        lever = _lever_arm_from_pose_or_wrench(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
             f"imu.position found: {_format_arm_mm(lever)} mm, from the {lever.source}; write it"
-            f" into the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
+            f" into the description as imu.position: {round_for_yaml(lever.p_SoIo_S)}"
         )
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
 
-def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
+def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
     if mounting is None:
         problem = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
-    elif mounting.mirrored:
+    elif mounting.is_mirrored:
         problem = "the axes of the IMU are mirrored relative to those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits_pose:
@@ -80,21 +80,21 @@ def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
 
 
 def _unexplained_shares_text(found: Mounting) -> str:
-    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
+    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_omega}
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
 
-def _rotation_notes(found: Mounting) -> list[str]:
+def _imu_rotation_notes(found: Mounting) -> list[str]:
     nearest = found.nearest_right_angled_rotation.astype(int).tolist()
     oblique = f"{found.angle_to_right_angled_deg:.1f} deg from the right-angled mounting {nearest}"
     std = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [
         f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
-        f" imu.frame: {_round_for_yaml(found.R_SI)}"
+        f" imu.frame: {round_for_yaml(found.R_SI)}"
     ]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
-    if abs(found.lag_s) > MAX_LAG_S:
+    if abs(found.lag_s) > MIN_LAG_OF_WARNING_S:
         notes.append(
             f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
             f" add {-found.lag_s:.3f} to imu.time.offset to correct it"
@@ -102,7 +102,7 @@ def _rotation_notes(found: Mounting) -> list[str]:
     return notes
 
 
-def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
+def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     lever = None
     if mounting is not None and mounting.fits_pose:
         lever = mounting.lever
@@ -132,7 +132,7 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
     return lever
 
 
-def _round_for_yaml(x: Array) -> list:
+def round_for_yaml(x: Array) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
@@ -168,23 +168,23 @@ def estimate_auto_pose_frame(
     changes: dict[str, Any] = {}
     notes: list[str] = []
     if pose.position_in_sensor == "auto":
-        _require_determined(
+        _require_determined_axes(
             frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
         )
         changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
         deviation = 1e3 * float(frame.position_deviations_m.max())
-        notes.append(_estimate_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
+        notes.append(_pose_frame_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
     if pose.rotation_in_sensor == "auto":
-        _require_determined(
+        _require_determined_axes(
             frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
         )
         changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
         deviation = float(frame.rotation_deviations_deg.max())
-        notes.append(_estimate_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
+        notes.append(_pose_frame_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
-def _require_determined(known: Any, where: str, quantity: str) -> None:
+def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
     if not known.all():
         axes = ", ".join(a for a, deviation in zip("xyz", known, strict=True) if not deviation)
         raise DrakeTeleopError(
@@ -194,11 +194,10 @@ def _require_determined(known: Any, where: str, quantity: str) -> None:
         )
 
 
-def _estimate_note(name: str, value: Any, deviation: str) -> str:
-    written = (np.round(value, 4) + 0.0).tolist()
+def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
     return (
         f"pose.{name} found, standard deviation {deviation}; write it into the description as"
-        f" pose.{name}: {written}"
+        f" pose.{name}: {round_for_yaml(value)}"
     )
 
 
@@ -231,7 +230,7 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     )
 
 
-_MAX_GRAVITY_DEVIATION_DEG = 2.0
+_MAX_GRAVITY_STD_DEG = 2.0
 
 
 def estimate_auto_gravity(
@@ -252,13 +251,13 @@ def estimate_auto_gravity(
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
         spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
         deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
-    if not deviation < _MAX_GRAVITY_DEVIATION_DEG:
+    if not deviation < _MAX_GRAVITY_STD_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",
             remedy="record the load in more orientations, without contact; or give the vector",
         )
-    gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
+    gravity = tuple(round_for_yaml(estimated))
     note = (
         f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"
         f" gravity: {list(gravity)}"

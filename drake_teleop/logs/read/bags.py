@@ -32,13 +32,11 @@ BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 _MAX_ARRAY_LENGTH = 64
 _MESSAGES_PER_BLOCK, _RECEPTION_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
-_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _MAX_UNPACKED_BYTES = 6, 200, 100_000_000
-_MAX_MEMORY_BYTES = 1_500_000_000  # bytes
-_TOO_LARGE_MESSAGE, _CUT_REMEDY = (
-    "its uncompressed size is too large",
-    "cut it, or write the topics one by one",
-)
-_VECTOR_GROUPS = (
+_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
+_MAX_ADDED_MEMORY_BYTES = 1_500_000_000  # bytes
+_TOO_LARGE_MESSAGE = "its uncompressed size is too large"
+_CUT_REMEDY = "cut it, or write the topics one by one"
+_VECTOR_FIELDS = (
     "force",
     "torque",
     "linear_acceleration",
@@ -46,9 +44,9 @@ _VECTOR_GROUPS = (
     "orientation",
     "position",
 )
-_GROUP_OF_FIELD = {name: name for name in _VECTOR_GROUPS}
-_GROUP_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
-_STREAM_TYPES = {
+_VECTOR_OF_FIELD = {name: name for name in _VECTOR_FIELDS}
+_VECTOR_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
+_MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
     "pose": (
@@ -78,10 +76,9 @@ def list_topics(path: Path) -> list[Topic]:
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
-            Topic(name, info.msgtype or "several", info.msgcount, info.msgcount / seconds)
-            if seconds > 0
-            else Topic(name, info.msgtype or "several", info.msgcount, 0.0)
+            Topic(name, info.msgtype or "several", count, count / seconds if seconds > 0 else 0.0)
             for name, info in sorted(reader.topics.items())
+            for count in [info.msgcount]
         ]
 
 
@@ -102,21 +99,21 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
             for message in [reader.deserialize(raw, connection.msgtype)]
             for part in getattr(message, "transforms", [message])
         )
-        blocks = _read_message_blocks(pairs, child_frame, f"{path}:{topic}")
+        blocks = _read_column_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     columns = _join_blocks(blocks)
     received = columns.pop(_RECEPTION_COLUMN)
-    absent = _remove_absent_groups(columns)
+    absent = _remove_fields_marked_absent(columns)
     columns |= _short_column_names(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
     columns["stamp"] = columns.get("header.stamp", received)
-    return Table(path / topic.lstrip("/"), columns, absent=absent)
+    return Table(path / topic.lstrip("/"), columns, absent_groups=absent)
 
 
-def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
+def read_stream_table(stream: Wrench | Imu | Pose | Static) -> Table:
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -129,7 +126,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
-    for stream, types in _STREAM_TYPES.items():
+    for stream, types in _MESSAGE_TYPES_OF_STREAM.items():
         kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
         suitable = [name for kind in types for name in kinds if kinds[name] == kind]
         if suitable:
@@ -179,7 +176,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
             if file.suffix.lower() == ".mcap":
                 _check_unpacked_size(file)
         standard = get_typestore(Stores.LATEST)
-        with _limit_memory(), AnyReader([path], default_typestore=standard) as reader:
+        with _limit_process_memory(), AnyReader([path], default_typestore=standard) as reader:
             yield reader
     except DrakeTeleopError:
         raise
@@ -196,7 +193,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
 
 
 def _check_unpacked_size(path: Path) -> None:
-    total, limit = 0, path.stat().st_size * _MAX_UNPACK_RATIO + _MAX_UNPACKED_BYTES
+    total, limit = 0, path.stat().st_size * _MAX_UNPACK_RATIO + _UNPACKED_BYTES_MARGIN
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(33)) == 33:  # head of a record
@@ -208,14 +205,14 @@ def _check_unpacked_size(path: Path) -> None:
 
 
 @contextmanager
-def _limit_memory() -> Iterator[None]:
+def _limit_process_memory() -> Iterator[None]:
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except OSError:  # only Linux enforces this limit
         yield
         return
-    limit = pages * resource.getpagesize() + _MAX_MEMORY_BYTES
+    limit = pages * resource.getpagesize() + _MAX_ADDED_MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit if soft < 0 else min(limit, soft), hard))
     try:
         yield
@@ -223,7 +220,7 @@ def _limit_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _read_message_blocks(
+def _read_column_blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
     children: set[str] = set()
@@ -287,7 +284,7 @@ def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _numeric_fields(value, f"{path}.")
 
 
-def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
+def _remove_fields_marked_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
     absent = tuple(
         name.removesuffix("_covariance")
         for name, values in columns.items()
@@ -302,6 +299,6 @@ def _short_column_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _GROUP_OF_FIELD and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_GROUP_OF_FIELD[group]}.{axis}", []).append(path)
+        if group in _VECTOR_OF_FIELD and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_VECTOR_OF_FIELD[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

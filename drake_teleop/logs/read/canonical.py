@@ -33,8 +33,8 @@ _KINEMATIC_COLUMNS = {
     "orientation": QUATERNION_COLUMNS,
     "position": POSITION_COLUMNS,
 }
-_MAX_REST_SPEED = 0.05  # rad/s
-_MIN_GRAVITY_ROTATION_RAD = np.radians(10.0)
+_MAX_REST_SPEED_RAD_S = 0.05  # rad/s
+_MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
 _ROW_SHAPES: dict[str, tuple[int, ...]] = {
     "t": (),
     "wrench": (6,),
@@ -67,7 +67,7 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        free: those of "gravity" and "weight" that are estimated from the data.
+        estimated: those of "gravity" and "weight" that are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
 
     Raises:
@@ -90,7 +90,7 @@ class Log:
     gravity_W: Array | None = None
     one_sided_s: float = 0.0
     described: Description | None = None
-    free: tuple[str, ...] = ()
+    estimated: tuple[str, ...] = ()
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -132,9 +132,9 @@ class Log:
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
-    def with_times_from(self, start: float) -> Log:
+    def with_times_relative_to(self, start: float) -> Log:
         """Return the log with times relative to `start` [s]."""
-        posed = None if self.posed is None else self.posed.with_times_from(start)
+        posed = None if self.posed is None else self.posed.with_times_relative_to(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def select_rows(self, rows: slice | NDArray[np.bool_]) -> Log:
@@ -181,7 +181,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     def are_columns_present(names: Sequence[str]) -> bool:
         found = [name for name in names if name in table.columns]
         if found and len(found) < len(names):
-            table.numbers(names, len(names), str(path))
+            table.finite_numbers(names, len(names), str(path))
         return bool(found)
 
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
@@ -190,7 +190,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
         )
-    table.numbers(WRENCH_COLUMNS, 6, str(path))
+    table.finite_numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
         name: {"columns": names}
         for name, names in _KINEMATIC_COLUMNS.items()
@@ -213,7 +213,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
         )
-    table.raw("t", str(path))
+    table.numbers_with_nan("t", str(path))
     stream = {"file": path, "time": {"column": "t"}}
     streams: dict[str, Any] = {"wrench": wrench | stream}
     pose = {name: fields.pop(name) for name in ("orientation", "position") if name in fields}
@@ -229,8 +229,8 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
     if not q and "specific_force" not in fields:
         return False
     if "angular_velocity" in fields:
-        speed = table.numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
-        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
+        speed = table.finite_numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
+        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED_RAD_S:
             return False
     if "t" not in table.columns:
         return True
@@ -242,10 +242,10 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if q:
         vertical = rotation_matrices(
-            table.numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
+            table.finite_numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
         )[:, 2]
     else:
-        vertical = table.numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
+        vertical = table.finite_numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _MIN_GRAVITY_ROTATION_RAD)
+    return bool(np.quantile(turned, 0.8) > _MIN_TURN_BETWEEN_POSES_RAD)

@@ -15,16 +15,16 @@ from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
-EPISODE_GAP_S = 1.0
+EPISODE_SPACING_S = 1.0
 """Least time between two episodes of a file [s]."""
 MIN_GAP_STEPS = 4.0
 """Least length of a gap in median steps."""
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
-_MAX_STEP_RATIO = 4.0
+_MAX_MEAN_OVER_MEDIAN_STEP = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
-_MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
+_MAX_EPISODE_START_OFFSET_STEPS, _MAX_STEP_AT_EPISODE_START_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
 _SMOOTHING_WINDOW_STAMPS = 50
 
 
@@ -33,21 +33,21 @@ class Clock:
     """Increasing times t (N,) of the rows of a stream on the common clock [s].
 
     Attributes:
-        rows: (N,) row of the table for each time.
-        total: number of the table's rows, with removed ones.
+        kept_rows: (N,) row of the table for each time.
+        num_rows: number of the table's rows, with removed ones.
         notes: sentences about corrections.
-        episodes: number of times at which the clock starts.
+        num_episodes: number of times at which the clock starts.
     """
 
     t: Array
-    rows: NDArray[np.intp]
-    total: int
+    kept_rows: NDArray[np.intp]
+    num_rows: int
     notes: tuple[str, ...] = ()
-    episodes: int = 1
+    num_episodes: int = 1
 
     def select_timed_rows(self, x: Array) -> Array:
-        """Return the rows of x (total, ...) that have a time."""
-        return x if len(self.rows) == self.total else x[self.rows]
+        """Return the rows of x (num_rows, ...) that have a time."""
+        return x if len(self.kept_rows) == self.num_rows else x[self.kept_rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
@@ -58,8 +58,8 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
-        return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
-    t, episodes = time_stamps_s(time, table, where)
+        return Clock(_apply_clock_scale_and_offset(rows / time.rate, time), rows, table.rows)
+    t, episodes = time_stamps_and_episodes(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
@@ -67,7 +67,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
-        rows = _remove_repetitions(rows, t, table, columns, where)
+        rows = _remove_repeated_rows(rows, t, table, columns, where)
         if len(rows) < before:
             notes.append(
                 f"{before - len(rows)} rows that repeat the previous row and its time stamp"
@@ -84,49 +84,49 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
             f" {np.abs(even - t).max():.2g} s"
         )
         t = even
-    _check_rate(t, time, where)
+    _check_rate_is_plausible(t, time, where)
     _check_stamps_are_even(t, rows, table, where)
-    return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
+    return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
-def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
+def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock.
     """
     assert time.column is not None
-    whole = table.whole or table
+    whole = table.whole_table or table
     names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
     for name in names:
-        stamps = whole.raw(name, f"{where}.column")
+        stamps = whole.numbers_with_nan(name, f"{where}.column")
         if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
-            whole.numbers([name], 1, f"{where}.column")
+            whole.finite_numbers([name], 1, f"{where}.column")
     if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
         raise DrakeTeleopError(
             "the column holds dates or times of day, which have no unit",
             where=f"{where}.unit",
             remedy="leave `unit` out",
         )
-    columns = whole.raw_side_by_side(names, f"{where}.column")
+    columns = whole.numbers_with_nan_side_by_side(names, f"{where}.column")
     t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
         t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
     t, episodes = join_episodes(t)
-    return (t if table.kept is None else t[table.kept]), episodes
+    return (t if table.kept_rows is None else t[table.kept_rows]), episodes
 
 
 def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
         raise DrakeTeleopError(
-            f"the clock starts {clock.episodes} times, which requires all streams in one file",
+            f"the clock starts {clock.num_episodes} times, which requires all streams in one file",
             where=where,
             remedy="write all streams into one table, or each episode into files of its own",
         )
     if not where.endswith("wrench.time"):
         return []
     return [
-        f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or more"
+        f"the clock starts {clock.num_episodes} times: the episodes follow each other, 1 s or more"
         " apart; samples near their ends are not used"
     ]
 
@@ -143,21 +143,21 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     if not len(back) or not (steps > 0.0).any():
         return t, 1
     step = float(np.median(steps[steps > 0.0]))
-    again = np.abs(known[back] - known[0]) <= _MAX_START_STEPS * step
+    again = np.abs(known[back] - known[0]) <= _MAX_EPISODE_START_OFFSET_STEPS * step
     if not again.all() or np.diff([0, *back, len(known)]).min() < _MIN_EPISODE_ROWS:
         return t, 1
     after = steps[back[:, None] + np.arange(_MIN_EPISODE_ROWS - 1)]
-    if (after > _MAX_FIRST_STEPS * step).any():  # one wrong stamp
+    if (after > _MAX_STEP_AT_EPISODE_START_STEPS * step).any():  # one wrong stamp
         return t, 1
     joined = known.copy()
     for start in back:
-        joined[start:] += joined[start - 1] + max(EPISODE_GAP_S, 10.0 * step) - joined[start]
+        joined[start:] += joined[start - 1] + max(EPISODE_SPACING_S, 10.0 * step) - joined[start]
     result = t.copy()
     result[finite] = joined
     return result, len(back) + 1
 
 
-def _to_common_clock(t: Array, time: Time) -> Array:
+def _apply_clock_scale_and_offset(t: Array, time: Time) -> Array:
     return t[:1] + time.scale * (t - t[:1]) + time.offset
 
 
@@ -173,11 +173,11 @@ def spread_shared_stamps(t: Array) -> Array:
 def find_gaps_in_times(t: Array, bandwidth_hz: float | None) -> Array:
     """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
-    at = np.flatnonzero(steps > min_gap_length(float(np.median(steps)), bandwidth_hz))
+    at = np.flatnonzero(steps > min_gap_length_s(float(np.median(steps)), bandwidth_hz))
     return np.stack([t[at], t[at + 1]], axis=1)
 
 
-def min_gap_length(step: float, bandwidth_hz: float | None) -> float:
+def min_gap_length_s(step: float, bandwidth_hz: float | None) -> float:
     """Return the least length of a gap [s]: four steps, and half a period of the bandwidth."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
@@ -204,10 +204,10 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     return line + smooth
 
 
-def _remove_repetitions(
+def _remove_repeated_rows(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
-    values = [table.raw(column, where) for column in columns]
+    values = [table.numbers_with_nan(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
     for x in values:
@@ -245,7 +245,7 @@ def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where
         )
 
 
-def _check_rate(t: Array, time: Time, where: str) -> None:
+def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:
     if len(t) < 2:
         return
     step = float(np.median(np.diff(t)))
@@ -269,13 +269,13 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
 
 def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
+    if len(t) < 3 or t[-1] - t[0] <= _MAX_MEAN_OVER_MEDIAN_STEP * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
     row = table.line_in_file(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s (at most {_MAX_STEP_RATIO:g} times that), longest"
+        f" {steps.mean():.3g} s (at most {_MAX_MEAN_OVER_MEDIAN_STEP:g} times that), longest"
         f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
         where=where,
         remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
-_ROWS_FOR_TYPES = 1000  # rows from which column types are inferred
+_ROWS_FOR_TYPE_INFERENCE = 1000  # rows from which column types are inferred
 _UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
@@ -61,7 +61,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         skip_lines=before,
         try_parse_dates=True,
     )
-    frame = _parse_with_types(parse)
+    frame = _parse_with_inferred_types(parse)
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
@@ -76,24 +76,24 @@ def _normalize_separators_and_encoding(
     returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
     # "1,500" can be 1500.
     commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
-    if not (returns or commas or _content_length(tail) < len(tail)):
+    if not (returns or commas or _length_without_blank_end(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
     text = _LONE_CR_PATTERN.sub(b"\n", text) if returns else text
     text = _QUOTED_NUMBER_PATTERN.sub(rb"\1.\2", text) if commas else text
-    return text[: _content_length(text)]
+    return text[: _length_without_blank_end(text)]
 
 
-def _content_length(text: bytes) -> int:
+def _length_without_blank_end(text: bytes) -> int:
     line = text.find(b"\n", len(text.rstrip(_BLANK_BYTES)))
     return len(text) if line < 0 else line + 1
 
 
-def _parse_with_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
+def _parse_with_inferred_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):
-        frame = parse(infer_schema_length=_ROWS_FOR_TYPES)
+        frame = parse(infer_schema_length=_ROWS_FOR_TYPE_INFERENCE)
         if all(kind.is_numeric() for kind in frame.dtypes):
             return frame
     return parse(infer_schema_length=None)

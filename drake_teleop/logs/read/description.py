@@ -46,7 +46,7 @@ from drake_teleop.logs.read.description_fields import (
 )
 
 YAML_ONLY_NOTE = "in a log description of this table; the canonical form has no such line"
-_MAX_GRAVITY = 100.0
+_MAX_GRAVITY_M_S2 = 100.0
 
 
 class Time(StrictModel):
@@ -141,18 +141,18 @@ class _RecordedStream(_Stream):
     )
     time: Time
 
-    _defaults: ClassVar[tuple[str, ...]] = ()
+    _quantities_of_topic: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
     @classmethod
     def _fill_topic_defaults(cls, data: Any) -> Any:
         if not isinstance(data, dict) or data.get("topic") is None:
             return data
-        data = {"time": {}, **{name: {} for name in cls._defaults}, **data}
+        data = {"time": {}, **{name: {} for name in cls._quantities_of_topic}, **data}
         time = data["time"]
         if isinstance(time, dict) and not {"column", "rate"} & set(time):
             data["time"] = {"column": "stamp", **time}
-        for name in cls._defaults:
+        for name in cls._quantities_of_topic:
             given = data[name]
             if isinstance(given, dict) and not {"columns", "form"} & set(given):
                 data[name] = {**_TOPIC_DEFAULTS[name], **given}
@@ -168,7 +168,7 @@ class _RecordedStream(_Stream):
 class Wrench(_RecordedStream):
     """File and columns of the force-torque sensor."""
 
-    _defaults = ("force", "torque")
+    _quantities_of_topic = ("force", "torque")
 
     force: Force
     torque: Torque
@@ -181,7 +181,7 @@ class Wrench(_RecordedStream):
 class Imu(_RecordedStream):
     """File and columns of an IMU."""
 
-    _defaults = ("specific_force", "angular_velocity")
+    _quantities_of_topic = ("specific_force", "angular_velocity")
 
     specific_force: Acceleration | None = None
     angular_velocity: AngularVelocity | None = None
@@ -212,7 +212,7 @@ class Imu(_RecordedStream):
 class Pose(_RecordedStream):
     """File and columns of a pose of sensor, flange or TCP."""
 
-    _defaults = ("orientation", "position")
+    _quantities_of_topic = ("orientation", "position")
 
     orientation: Orientation
     position: Position | None = None
@@ -289,9 +289,9 @@ class Description(StrictModel):
     static: Static | None = None
 
     @model_validator(mode="after")
-    def _check_streams(self) -> Description:
-        if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
-            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2: give it in m/s^2")
+    def _check_stream_combination(self) -> Description:
+        if np.abs(self.gravity_W).max() > _MAX_GRAVITY_M_S2:
+            raise ValueError(f"gravity exceeds {_MAX_GRAVITY_M_S2:g} m/s^2: give it in m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto is found from a pose alone: add pose, and remove imu")
         if self.static is not None:
@@ -324,17 +324,23 @@ class Description(StrictModel):
             raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
 
     @property
+    def streams(self) -> dict[str, Any]:
+        """The described ones of wrench, imu, pose and static, by name."""
+        fields = ((name, getattr(self, name)) for name in ("wrench", "imu", "pose", "static"))
+        return {name: stream for name, stream in fields if stream is not None}
+
+    @property
     def gravity_W(self) -> Array:
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
-    def add_pose_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
+    def poses_with_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
         return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
 
-    def si_value(self, unit: str) -> float:
+    def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
 
@@ -372,8 +378,7 @@ def load_description(path: str | Path) -> Description:
 def _resolve_paths(description: Description, folder: Path) -> Description:
     streams = {
         name: stream.model_copy(update={"file": folder / stream.file})
-        for name in ("wrench", "imu", "pose", "static")
-        if (stream := getattr(description, name)) is not None
+        for name, stream in description.streams.items()
     }
     return description.model_copy(update=streams)
 

@@ -11,7 +11,7 @@ from drake_teleop.common.rotations import nearest_rotation, orthogonality_error
 
 ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
-_MIN_SCALE = 1e-12
+_MIN_SCALE_FACTOR = 1e-12
 STANDARD_GRAVITY = 9.80665
 SI_VALUE_OF_UNIT = {
     "s": 1.0,
@@ -96,8 +96,8 @@ def _parse_gravity(value: Any) -> Any:
 
 def _parse_scale(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
-    if any(_is_number(x) and abs(x) < _MIN_SCALE for x in factors):
-        raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE:g}")
+    if any(_is_number(x) and abs(x) < _MIN_SCALE_FACTOR for x in factors):
+        raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE_FACTOR:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 
@@ -138,9 +138,9 @@ _SCALE_SCHEMA = {
     "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
 }
 Scale = Annotated[Vector, BeforeValidator(_parse_scale), WithJsonSchema(_SCALE_SCHEMA)]
-Vector4 = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
+MassAndMoment = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Weight = Annotated[
-    Vector4 | Literal["removed"] | None,
+    MassAndMoment | Literal["removed"] | None,
     BeforeValidator(_parse_weight),
     Field(
         description="weight that the robot has subtracted: removed (that of the load), or that of a"
@@ -162,7 +162,7 @@ class StrictModel(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _limit_size(cls, value: Any) -> Any:
+    def _reject_huge_numbers(cls, value: Any) -> Any:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
                 raise ValueError(f"{number:g} exceeds 1e12")

@@ -25,12 +25,12 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
-_MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
+_MIN_DRIFT_LIKELIHOOD_GAIN, _MIN_DRIFT_S = 50.0, 0.01
 SignalPairs = list[tuple[Array, Array]]
-"""Signal of the pose and of the IMU, for each sensor, see `comparable_signals`."""
+"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs_of_pose_and_imu`."""
 
 
-def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
+def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
     """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
@@ -46,13 +46,13 @@ def lag_of_imu_clock(t: Array, pairs: SignalPairs, t_imu: Array, reach: float, a
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def remove_arm(x: Array) -> Array:
+    def remove_arm_effects(x: Array) -> Array:
         return x - U @ (U.T @ x)
 
-    expected, sensed = [remove_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+    expected, sensed = [remove_arm_effects(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
 
     def unexplained_at_shift(shift: float) -> float:
-        moved = remove_arm(resample(t + shift, t_imu, sensed))
+        moved = remove_arm_effects(resample(t + shift, t_imu, sensed))
         return sum(
             _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
         )
@@ -98,7 +98,7 @@ def estimate_clock_drift(
         found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
     gain = independent * np.log(start / (cost + 1e-300))
     total_drift_s = abs(found[1]) * float(t[-1] - t[0])
-    if gain < _MIN_LIKELIHOOD_RATIO or total_drift_s < _MIN_DRIFT_S:
+    if gain < _MIN_DRIFT_LIKELIHOOD_GAIN or total_drift_s < _MIN_DRIFT_S:
         return lag, 0.0
     return float(found[0]), float(found[1])
 
@@ -117,7 +117,7 @@ MIN_SINGULAR_RATIO = 1e-5
 _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def solve_least_squares(
+def nonlinear_least_squares(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
@@ -141,14 +141,16 @@ def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Arr
     sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
     known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
 
-    def weigh(z: Array) -> Array:
+    def weighted_residual(z: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
     def jacobian(z: Array) -> Array:
-        found = approx_fprime(z[:others], lambda y: weigh(np.append(y, z[others:])))
+        found = approx_fprime(z[:others], lambda y: weighted_residual(np.append(y, z[others:])))
         return np.hstack([found, known])
 
-    return least_squares(weigh, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
+    return least_squares(
+        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS
+    )
 
 
 def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
@@ -177,7 +179,7 @@ COMPARISON_CUTOFF_HZ = 8.0
 MAX_COMPARED_SAMPLES = 1500
 """Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
-_MIN_SIGNAL_RATIO = 20.0
+_MIN_SIGNAL_OVER_NOISE_POWER = 20.0
 
 
 @dataclass(frozen=True)
@@ -209,7 +211,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     delay = estimate_delay(log, None) or 0.0
     smooth = low_pass_log(remove_delay(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
-    t = common_times_of_logs(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
+    t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
     if len(t) < MAX_COMPARED_SAMPLES // 10:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
@@ -226,7 +228,9 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     target = (wrench - wrench.mean(axis=0)).ravel()
     phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve_least_squares(residual_at, np.concatenate([np.zeros(4), offsets, phi]))
+    x, deviations = nonlinear_least_squares(
+        residual_at, np.concatenate([np.zeros(4), offsets, phi])
+    )
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED_SHARE * whole).any():
         return None
@@ -234,7 +238,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
-def common_times_of_logs(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
+def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, MAX_COMPARED_SAMPLES)
     known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
@@ -254,14 +258,14 @@ def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
     alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
-    return alone > _MIN_SIGNAL_RATIO * (noise.sum() - noise)
+    return alone > _MIN_SIGNAL_OVER_NOISE_POWER * (noise.sum() - noise)
 
 
 MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
 """Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
-MAX_DEVIATION_DEG = 1.0
+MAX_ROTATION_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
-MAX_UNEXPLAINED_GRAVITY = 0.005
+MAX_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_LAG_S = 1.0
 
@@ -273,11 +277,12 @@ class Mounting:
     Attributes:
         R_SI: (3, 3) rotation from the described IMU axes to S.
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
-        lag_middle_s, middle_s: lag at mid-record, and this time on the pose's clock [s].
+        mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
+            [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained, unexplained_turning: unexplained shares of the variance of specific force and
-            angular velocity (None without a gyroscope).
-        mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
+        unexplained, unexplained_omega: unexplained shares of the variance of specific
+            force and angular velocity (None without a gyroscope).
+        is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
         lever: position of the accelerometer; None without positions.
@@ -285,12 +290,12 @@ class Mounting:
 
     R_SI: Array
     lag_s: float
-    lag_middle_s: float
-    middle_s: float
+    mid_record_lag_s: float
+    mid_record_time_s: float
     drift: float
     unexplained: float
-    unexplained_turning: float | None
-    mirrored: bool
+    unexplained_omega: float | None
+    is_mirrored: bool
     speed_ratio: float | None
     deviations_deg: Array
     lever: LeverArm | None
@@ -317,18 +322,20 @@ class Mounting:
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
-            self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED_SHARE
+            self.unexplained_omega is None or self.unexplained_omega < MAX_UNEXPLAINED_SHARE
         )
         if self.lever is not None:
-            return not self.mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
+            return (
+                not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
+            )
         # Without positions the pose determines the angular velocity, but not the acceleration.
-        known = self.unexplained_turning is not None or self.unexplained < MAX_UNEXPLAINED_GRAVITY
-        return not self.mirrored and omega_agrees and known
+        known = self.unexplained_omega is not None or self.unexplained < MAX_SHARE_WITHOUT_POSITIONS
+        return not self.is_mirrored and omega_agrees and known
 
     @property
     def is_determined(self) -> bool:
         """Whether the fit is valid and gives R_SI to 1 deg about every axis."""
-        return self.fits_pose and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
+        return self.fits_pose and bool((self.deviations_deg < MAX_ROTATION_DEVIATION_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
@@ -341,13 +348,13 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
     cutoff = min(COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
     sensed, smooth = low_pass_log(imu, cutoff), low_pass_log(pose, cutoff)
-    t = common_times_of_logs(start + reach, stop - reach, (imu, pose), cutoff)
+    t = times_outside_gaps(start + reach, stop - reach, (imu, pose), cutoff)
     if len(t) < MAX_COMPARED_SAMPLES // 10:
         return None
     # Without a gyroscope both readings contain the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
     gyroscope = not np.allclose(omega_imu, omega, atol=1e-9)
-    pairs = comparable_signals(t, sensed, smooth, gyroscope)
+    pairs = signal_pairs_of_pose_and_imu(t, sensed, smooth, gyroscope)
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
@@ -363,8 +370,8 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
-    t = common_times_of_logs(start + margin, stop - margin, (imu, pose), cutoff)
-    pairs = comparable_signals(t, sensed, smooth, gyroscope)
+    t = times_outside_gaps(start + margin, stop - margin, (imu, pose), cutoff)
+    pairs = signal_pairs_of_pose_and_imu(t, sensed, smooth, gyroscope)
     pose_omega = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
@@ -382,12 +389,12 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     return Mounting(
         R_SI=_rotated_by_vector(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
-        lag_middle_s=float(x[3]),
-        middle_s=centre,
+        mid_record_lag_s=float(x[3]),
+        mid_record_time_s=centre,
         drift=drift,
         unexplained=shares[0],
-        unexplained_turning=shares[1] if len(shares) > 1 else None,
-        mirrored=mirrored,
+        unexplained_omega=shares[1] if len(shares) > 1 else None,
+        is_mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
         lever=lever,
@@ -418,7 +425,7 @@ def _refine_rotation_and_lag(
     linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
     linear[:, :3, :3] = -K
     linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve_least_squares(pose_residual, first, linear)
+    x, deviations = nonlinear_least_squares(pose_residual, first, linear)
     return x, deviations, pose_residual(x)
 
 

@@ -34,7 +34,7 @@ from drake_teleop.logs.read.auto_frames import (
     restore_weight,
     wrench_of_weight,
 )
-from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
+from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
@@ -47,23 +47,23 @@ from drake_teleop.logs.read.description import (
     load_description,
 )
 from drake_teleop.logs.read.streams import (
-    MAX_SIGNAL_VALUES,
+    MAX_PLAUSIBLE_VALUES,
     MIN_STREAM_SAMPLES,
     OrientationColumns,
     Stream,
-    common_time_of_streams,
     resample_to_clock,
     specific_force_at_So,
+    uniform_times_of_streams,
     world_to_S,
     wrench_world_to_S,
 )
 from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
-from drake_teleop.logs.read.tables import Table, decimal_step
+from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
-_CHUNK_ROWS = 2**16
-_MAX_GAP_OVER_STEP = 4.0
+_CONVERTED_CHUNK_ROWS = 2**16
+_MIN_GAP_OVER_STEP = 4.0
 _EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
@@ -151,7 +151,7 @@ class _LogReader:
             self._replace_auto_fields(estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
-        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.total)
+        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.num_rows)
         wrench = clock.select_timed_rows(wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -159,15 +159,17 @@ class _LogReader:
         if self._description.imu is not None:
             imu = self._read_imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
-        t = common_time_of_streams(clock.t, streams, self._source)
+        t = uniform_times_of_streams(clock.t, streams, self._source)
         wrench = resample(t, clock.t, wrench)
         log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
-        log = replace(log, gain_std=gain_std, free=free, described=self._description)
-        if pose is not None and pose.raw is not None:
-            inertial = None if imu is None else imu.inertial
-            log = replace(log, posed=self._description.add_pose_frame(pose.raw, inertial))
-        log = log if keep_origin else log.with_times_from(float(clock.t[0]))
+        log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
+        if pose is not None and pose.recorded_poses is not None:
+            inertial = None if imu is None else imu.imu_data
+            log = replace(
+                log, posed=self._description.poses_with_frame(pose.recorded_poses, inertial)
+            )
+        log = log if keep_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
@@ -180,15 +182,14 @@ class _LogReader:
         self._notes += notes
 
     def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
-        for name in ("wrench", "imu", "pose"):
-            if (stream := getattr(self._description, name)) is not None:
-                self._table_of_stream(stream)
+        for stream in self._description.streams.values():
+            self._table_of_stream(stream)
         reader = _LogReader(description, self._source, 30.0, self._tables)
         return reader.read_recording(differentiate=differentiate)
 
     def _table_of_stream(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
-            self._tables[stream.source] = read_stream(stream)
+            self._tables[stream.source] = read_stream_table(stream)
         table = self._tables[stream.source]
         return table if isinstance(stream, Static) else table.rows_with_numbers(stream.columns)
 
@@ -206,16 +207,16 @@ class _LogReader:
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> Array:
         where = f"{self._source}:{name}.{field}.columns"
-        values = table.numbers(quantity.columns, 3, where, rows)
+        values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= sign * self._description.si_value(quantity.unit) * np.array(quantity.scale)
+        values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
         is_table = Path(self._source).suffix.lower() in TABLE_READERS
         of_table = f" ({YAML_ONLY_NOTE})" if is_table else ""
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_size(values, *MAX_SIGNAL_VALUES[field], where, remedy)
+        table.check_magnitude(values, *MAX_PLAUSIBLE_VALUES[field], where, remedy)
         return values
 
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -227,9 +228,9 @@ class _LogReader:
             raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
             wrench, imu = self._description.wrench, self._description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
-                return Stream("pose", t, raw=raw)
+                return Stream("pose", t, recorded_poses=raw)
         dt = mean_time_step(t)
-        self._extend_one_sided_ends(dt)
+        self._include_window_in_one_sided_ends(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -249,15 +250,17 @@ class _LogReader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._read_vectors("pose", "position", stream.position, table, clock.total)
+            position = self._read_vectors(
+                "pose", "position", stream.position, table, clock.num_rows
+            )
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
-        orientations = OrientationColumns(self._description, form, table, clock.total, where)
-        quaternion = orientations.allocate_quaternions(len(clock.rows))
+        orientations = OrientationColumns(self._description, form, table, clock.num_rows, where)
+        quaternion = orientations.allocate_quaternions(len(clock.kept_rows))
         origin = np.array(stream.position_in_sensor)
-        for start in range(0, len(quaternion), _CHUNK_ROWS):
-            part = slice(start, start + _CHUNK_ROWS)
-            q = orientations.quaternions(clock.rows[part])
+        for start in range(0, len(quaternion), _CONVERTED_CHUNK_ROWS):
+            part = slice(start, start + _CONVERTED_CHUNK_ROWS)
+            q = orientations.quaternions(clock.kept_rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
@@ -278,22 +281,22 @@ class _LogReader:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
-            values = self._read_vectors("imu", field, quantity, table, clock.total, sign)
+            values = self._read_vectors("imu", field, quantity, table, clock.num_rows, sign)
             values = resample(t, raw_t, clock.select_timed_rows(values))
             return self._rotate_to_S("imu", stream.frame, values, t, pose)
 
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._extend_one_sided_ends(dt)
+            self._include_window_in_one_sided_ends(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        outside_gaps = raw_t[at] - raw_t[at - 1] < _MAX_GAP_OVER_STEP * dt  # outside of gaps
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_GAP_OVER_STEP * dt  # outside of gaps
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, inertial=ImuData(t[outside_gaps], *both))
+        return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
     def _rotate_to_S(
         self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
@@ -303,10 +306,12 @@ class _LogReader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._orientation_error(name)
+            raise self._no_orientation_error(name)
         return world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _orientation_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
+    def _no_orientation_error(
+        self, name: str, remedy: str = "add a pose stream"
+    ) -> DrakeTeleopError:
         return DrakeTeleopError(
             "vectors in the axes of the base cannot be rotated to S without an orientation",
             where=f"{self._source}:{name}.frame",
@@ -332,7 +337,7 @@ class _LogReader:
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._orientation_error("static", remedy)
+                raise self._no_orientation_error("static", remedy)
             wrench = wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
@@ -350,13 +355,15 @@ class _LogReader:
             source=self._source,
             gain_std=stream.gain_std,
             described=self._description,
-            resolution=self._quantization_step(stream, table),
+            resolution=self._quantization_steps(stream, table),
         )
 
-    def _quantization_step(self, stream: Static, table: Table) -> tuple[float, float]:
+    def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
         force, torque = (
-            decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
-            * (self._description.si_value(quantity.unit) * np.abs(quantity.scale).max())
+            decimal_resolution(
+                table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
+            )
+            * (self._description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
         return force, torque
@@ -376,9 +383,8 @@ class _LogReader:
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
         found_gaps = find_gaps_in_times(t, self._bandwidth_hz)
-        if clock.episodes > 1:
-            described = (self._description.wrench, self._description.imu, self._description.pose)
-            files = len({stream.source for stream in described if stream is not None})
+        if clock.num_episodes > 1:
+            files = len({stream.source for stream in self._description.streams.values()})
             self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
@@ -395,7 +401,7 @@ class _LogReader:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _extend_one_sided_ends(self, dt: float) -> None:
+    def _include_window_in_one_sided_ends(self, dt: float) -> None:
         self._one_sided_s = max(self._one_sided_s, self._half_window_s(dt))
 
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
@@ -415,7 +421,7 @@ class _LogReader:
             if in_base:
                 wrench = wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._orientation_error("wrench")
+            raise self._no_orientation_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(

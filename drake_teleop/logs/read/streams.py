@@ -24,7 +24,7 @@ from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
-MAX_SIGNAL_VALUES = {
+MAX_PLAUSIBLE_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -40,7 +40,7 @@ MAX_SIGNAL_VALUES = {
 class Stream:
     """Signals (N, ...) of one stream on its clock `t` [s]; None for absent signals.
 
-    `raw` are the recorded poses of S, `inertial` the IMU data in S.
+    `recorded_poses` are the poses of S, `imu_data` the IMU data in S.
     """
 
     name: str
@@ -49,8 +49,8 @@ class Stream:
     angular_velocity: Array | None = None
     angular_acceleration: Array | None = None
     R_WS: Array | None = None
-    raw: Poses | None = None
-    inertial: ImuData | None = None
+    recorded_poses: Poses | None = None
+    imu_data: ImuData | None = None
 
     @property
     def dt(self) -> float:
@@ -104,9 +104,9 @@ class OrientationColumns:
     ) -> None:
         self._orientation, self._table, self._where = orientation, table, where
         width = NUM_COLUMNS_OF_FORM[orientation.form]
-        self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
+        self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.si_value(orientation.unit)
+            self._columns *= description.unit_in_si(orientation.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
         """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
@@ -116,7 +116,7 @@ class OrientationColumns:
         """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
         orientation = self._orientation
         R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_errors(orthogonality_error(R), rows)
+        self._check_rotation_errors(orthogonality_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
@@ -127,13 +127,13 @@ class OrientationColumns:
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
         squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
-        self._check_errors(np.abs(squared**2 - 1.0), rows)
+        self._check_rotation_errors(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
             q[:, 1:] *= -1.0
         return q
 
-    def _check_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
+    def _check_rotation_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
@@ -144,7 +144,7 @@ class OrientationColumns:
             )
 
 
-def common_time_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
+def uniform_times_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
     """Return uniform times at the wrench's rate, within the time spans of all streams."""
     start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
     stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])

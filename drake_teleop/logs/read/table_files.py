@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
-from drake_teleop.logs.read.array_files import read_mat
+from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.tables import Table
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
-_CANONICAL_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
-_Column = TypeVar("_Column")
+_WRENCH_COLUMN_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_ColumnType = TypeVar("_ColumnType")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _MAX_CELLS_IN_MEMORY = 2**24
 """Number of cells above which columns of a Parquet file are read on access."""
@@ -56,24 +56,24 @@ def _read_text(path: Path, header: bool = True) -> Table:
     frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_to_numpy(series) for series in frame.get_columns()]
-    columns = dict(zip(_strip_names(names), found, strict=True))
-    return Table(path, _add_canonical_names(columns), first_row)
+    columns = dict(zip(_strip_column_names(names), found, strict=True))
+    return Table(path, _add_lower_case_names(columns), first_row)
 
 
-def _strip_names(names: list[str]) -> list[str]:
+def _strip_column_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
         raise ValueError("two column names differ only in spaces at their ends")
     return stripped
 
 
-def _add_canonical_names(columns: dict[str, _Column]) -> dict[str, _Column]:
+def _add_lower_case_names(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
     small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _CANONICAL_NAMES.issubset(small)
-    return small | columns if canonical and not _CANONICAL_NAMES.issubset(columns) else columns
+    canonical = len(small) == len(columns) and _WRENCH_COLUMN_NAMES.issubset(small)
+    return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
 
 
-def _read_frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
+def _read_with_polars(path: Path) -> dict[str, NDArray] | _LazyColumns:
     import polars as pl
 
     kind = path.suffix.lower()
@@ -92,7 +92,7 @@ def _read_frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     return _collect_columns(frame, columns)
 
 
-def columns_with_nested(frame: pl.LazyFrame) -> dict[str, NDArray]:
+def numeric_and_nested_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
     """Return columns of a Polars frame by name, and elements of lists and structures as columns.
 
     Columns of text and binary data, such as images, are omitted.
@@ -118,8 +118,8 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     columns: dict[str, pl.Expr] = {}
     for name, dtype in frame.collect_schema().items():
         columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
-    _strip_names(list(frame.collect_schema()))
-    return _add_canonical_names(columns)
+    _strip_column_names(list(frame.collect_schema()))
+    return _add_lower_case_names(columns)
 
 
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
@@ -195,18 +195,6 @@ def array_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
     return parts | arrays
 
 
-def _read_hdf5(path: Path) -> dict[str, NDArray]:
-    from drake_teleop.logs.read.array_files import read_hdf5
-
-    return read_hdf5(path)
-
-
-def _read_zarr(path: Path) -> dict[str, NDArray]:
-    from drake_teleop.logs.read.array_files import read_zarr
-
-    return read_zarr(path)
-
-
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
@@ -227,7 +215,7 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
 _ArrayReader = Callable[[Path], dict[str, NDArray]]
 
 
-def _columns_reader(read: _ArrayReader) -> _ArrayReader:
+def _reader_of_columns(read: _ArrayReader) -> _ArrayReader:
     return lambda path: array_columns(read(path))
 
 
@@ -236,14 +224,14 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
         **dict.fromkeys(
-            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_frame_columns
+            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_with_polars
         ),
-        ".npz": _columns_reader(_read_npz),
-        ".npy": _columns_reader(_read_npy),
-        ".mat": _columns_reader(read_mat),
-        ".h5": _columns_reader(_read_hdf5),
-        ".hdf5": _columns_reader(_read_hdf5),
-        ".zarr": _columns_reader(_read_zarr),
+        ".npz": _reader_of_columns(_read_npz),
+        ".npy": _reader_of_columns(_read_npy),
+        ".mat": _reader_of_columns(read_mat),
+        ".h5": _reader_of_columns(read_hdf5),
+        ".hdf5": _reader_of_columns(read_hdf5),
+        ".zarr": _reader_of_columns(read_zarr),
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""

@@ -30,42 +30,44 @@ class Table:
         columns: arrays (N,) of any type by name; also (N, ...), with its elements as `name[0]`,
             row-major.
         first_row: number of the first data row in the file.
-        absent: names of column groups that the file marks as not provided.
-        whole: table of all rows, if this one has only some of them.
-        kept: row numbers in `whole`, counted from 0; None: all rows.
+        absent_groups: names of column groups that the file marks as not provided.
+        whole_table: table of all rows, if this one has only some of them.
+        kept_rows: row numbers in `whole_table`, counted from 0; None: all rows.
     """
 
     path: Path
     columns: MutableMapping[str, NDArray]
     first_row: int = 1
-    absent: tuple[str, ...] = ()
-    whole: Table | None = None
-    kept: NDArray[np.intp] | None = None
+    absent_groups: tuple[str, ...] = ()
+    whole_table: Table | None = None
+    kept_rows: NDArray[np.intp] | None = None
 
     def line_in_file(self, row: int) -> int:
         """Return the number that a row of this table has in its file, for messages."""
-        return self.first_row + int(row if self.kept is None else self.kept[row])
+        return self.first_row + int(row if self.kept_rows is None else self.kept_rows[row])
 
     def rows_with_numbers(self, names: Sequence[str | int]) -> Table:
         """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
-        if not names or np.isfinite(self.raw(names[0], "")).all():
+        if not names or np.isfinite(self.numbers_with_nan(names[0], "")).all():
             return self
-        columns = [self.raw(name, "") for name in names]
+        columns = [self.numbers_with_nan(name, "") for name in names]
         if len({len(column) for column in columns}) > 1:
             return self
         rows = np.flatnonzero(np.isfinite(np.hstack(columns)).any(axis=1))
         if not 0 < len(rows) < self.rows:
             return self
-        return replace(self, columns=_SelectedRows(self.columns, rows), whole=self, kept=rows)
+        return replace(
+            self, columns=_SelectedRows(self.columns, rows), whole_table=self, kept_rows=rows
+        )
 
     @property
     def rows(self) -> int:
-        if self.kept is not None:
-            return len(self.kept)
+        if self.kept_rows is not None:
+            return len(self.kept_rows)
         return max(len(column) for column in self.columns.values())
 
-    def numbers(
+    def finite_numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
         """Return the numbers (N, width) of the named columns, side by side."""
@@ -73,7 +75,7 @@ class Table:
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
             rows = len(column) if rows is None else rows
-            self._check_rows([name], [column], where, rows)
+            self._check_row_counts([name], [column], where, rows)
             out = out if found else np.empty((rows, width))
             found += column.shape[1]
             if found <= width:
@@ -86,7 +88,7 @@ class Table:
             )
         return out
 
-    def _check_rows(
+    def _check_row_counts(
         self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
     ) -> None:
         rows = len(columns[0]) if columns and rows is None else rows
@@ -98,12 +100,12 @@ class Table:
                     remedy="name columns that belong together",
                 )
 
-    def raw_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
-        columns = [self.raw(name, where) for name in names]
-        self._check_rows(names, columns, where, None)
+    def numbers_with_nan_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
+        columns = [self.numbers_with_nan(name, where) for name in names]
+        self._check_row_counts(names, columns, where, None)
         return np.hstack(columns)
 
-    def raw(self, name: str | int, where: str) -> Array:
+    def numbers_with_nan(self, name: str | int, where: str) -> Array:
         """Return the numbers (N, k) of a column, with NaN and infinity; errors name `where`."""
         name = str(name)
         if name not in self.columns:
@@ -111,12 +113,12 @@ class Table:
         column = self.columns[name]
         numbers = _column_to_numbers(column, partial(self._cell_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
-        self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
+        self.check_magnitude(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
     def single_column(self, name: str | int, where: str) -> Array:
         """Return the numbers (N,) of a column, with NaN and infinity."""
-        numbers = self.raw(name, where)
+        numbers = self.numbers_with_nan(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
                 f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1",
@@ -125,7 +127,7 @@ class Table:
             )
         return numbers[:, 0]
 
-    def check_size(
+    def check_magnitude(
         self,
         values: Array,
         largest: float,
@@ -149,7 +151,7 @@ class Table:
 
     def _finite_column(self, name: str, where: str) -> Array:
         if name not in self.columns:
-            if name.rpartition(".")[0] in self.absent:
+            if name.rpartition(".")[0] in self.absent_groups:
                 raise DrakeTeleopError(
                     f"{self.path.name} marks {name!r} as not provided (covariance -1)",
                     where=where,
@@ -162,7 +164,7 @@ class Table:
                 where=where,
                 remedy=f"{hint} {_join_names(similar or list(self.columns))}",
             )
-        numbers = self.raw(name, where)
+        numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
             first = int(np.argmax(bad))
@@ -187,7 +189,7 @@ class Table:
         )
 
 
-def decimal_step(values: Array) -> float:
+def decimal_resolution(values: Array) -> float:
     """Return the largest power of ten <= 1 of which all values are multiples, or 0."""
     for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))

@@ -179,7 +179,7 @@ def _read_delay_trace(path: Path, period: float) -> NDArray[np.float64]:
     from drake_teleop.logs.read.table_files import read_table
 
     table = read_table(path)
-    time = table.numbers(["time"], 1, str(path))[:, 0]
+    time = table.finite_numbers(["time"], 1, str(path))[:, 0]
     delay = table.single_column("delay", str(path))
     if len(delay) != len(time):
         what = f"has {len(delay)} values, the column time has {len(time)}"
