@@ -31,7 +31,7 @@ from drake_teleop.station.simulation import (
     advance_without_garbage_collection,
     simulate,
 )
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, sensor_motion
+from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, sensor_motion
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -306,7 +306,7 @@ def test_the_slave_follows_the_scaled_master(slave):
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
     )
-    out = np.zeros(FRAME_STATE_SIZE)
+    out = np.zeros(SENSOR_MOTION_SIZE)
     heights = []
     for state in result["slave_state"]:
         sensor_motion(slave.arm.table, state[:6], state[6:], np.zeros(6), out)

@@ -215,7 +215,7 @@ class ReplayScene:
         touched = AddedEnvironment([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)
-        self._sheet = touched.sheet
+        self._sheet = touched.leaf_instance
         self._master = None
         if "master_state" in recorded:
             self._master = _add_haptic_device(self.plant, scenario)
@@ -337,7 +337,7 @@ def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
         return ordered
 
     return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), plant_positions, parsed.folder
+        parsed.instance, parsed.sensor_frame, np.zeros(3), plant_positions, parsed.mesh_folder
     )
 
 

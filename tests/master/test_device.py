@@ -20,19 +20,19 @@ NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
     """Return postures inside all joint limits, including the five-bar's."""
     rng = np.random.default_rng(seed)
-    q = rng.uniform(phantom.JOINT_LOWER, phantom.JOINT_UPPER, (40 * count, 6))
-    lower, upper = phantom.FIVE_BAR_RANGE
+    q = rng.uniform(phantom.JOINT_LOWER_RAD, phantom.JOINT_UPPER_RAD, (40 * count, 6))
+    lower, upper = phantom.FIVE_BAR_RANGE_RAD
     allowed = (q[:, 1] - q[:, 2] > lower) & (q[:, 1] - q[:, 2] < upper)
     return q[allowed][:count]
 
 
 def parameters(hand_mass=0.0, hand_inertia=0.0, friction=NO_FRICTION) -> np.ndarray:
-    return Master(friction=friction).device(hand_mass, hand_inertia).numbers
+    return Master(friction=friction).device(hand_mass, hand_inertia).parameters
 
 
 def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
     vdot = np.empty(6)
-    phantom.acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
+    phantom.joint_acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
     return vdot
 
 
@@ -52,7 +52,7 @@ def main_gravity(q) -> np.ndarray:
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
-    weight = phantom.WRIST_MASS * phantom.GRAVITY
+    weight = phantom.WRIST_MASS * phantom.GRAVITY_M_S2
     height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
     return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
 
@@ -109,7 +109,9 @@ def test_main_axes_equal_the_closed_forms_of_the_literature():
 
 def test_stylus_is_level_and_points_to_operator_at_home():
     np.testing.assert_allclose(
-        phantom.forward_kinematics(phantom.HOME_POSTURE), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
+        phantom.forward_kinematics(phantom.HOME_POSTURE_RAD),
+        [1, 0, 0, 0, 0.215, 0, -0.170],
+        atol=1e-15,
     )
 
 
@@ -294,8 +296,8 @@ STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5,
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_joint_stops_at_its_limit(joint, side):
-    limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
-    q = phantom.HOME_POSTURE.copy()
+    limit = (phantom.JOINT_UPPER_RAD if side > 0 else phantom.JOINT_LOWER_RAD)[joint]
+    q = phantom.HOME_POSTURE_RAD.copy()
     q[joint] = limit - side * 0.02
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
@@ -315,8 +317,10 @@ def test_joint_stops_at_its_limit(joint, side):
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_end_stop_pushes_but_never_pulls(joint, side):
-    q = phantom.HOME_POSTURE.copy()
-    q[joint] = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint] + side * 0.01
+    q = phantom.HOME_POSTURE_RAD.copy()
+    q[joint] = (phantom.JOINT_UPPER_RAD if side > 0 else phantom.JOINT_LOWER_RAD)[
+        joint
+    ] + side * 0.01
     if joint in (1, 2):
         q[3 - joint] = q[joint] - side * 0.1
     back = []
@@ -379,7 +383,7 @@ def test_ports_agree_with_the_state():
 
 def test_long_period_or_start_beyond_limit_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"master\.period"):
-        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE)
+        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE_RAD)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
         device.MasterDevice(5e-4, Master().device(0.1, 1e-4), np.array([2.0, 0, 0, 0, 0, 0]))
 
@@ -391,7 +395,7 @@ def test_friction_too_large_for_the_step_is_rejected(name, slope):
     def made(last):
         friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
         model = Master(friction=friction).device(0.1, 1e-4)
-        device.MasterDevice(5e-4, model, phantom.HOME_POSTURE)
+        device.MasterDevice(5e-4, model, phantom.HOME_POSTURE_RAD)
 
     made(0.5)
     with pytest.raises(DrakeTeleopError, match=r"master\.friction"):

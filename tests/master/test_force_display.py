@@ -29,7 +29,7 @@ def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
-    start = initial_display_state(np.array(q, dtype=float), DEVICE.numbers)
+    start = initial_display_state(np.array(q, dtype=float), DEVICE.parameters)
     block.GetInputPort("for_display").FixValue(context, start)
     return (
         block.GetOutputPort("drive").Eval(context)[:6].copy(),
@@ -81,9 +81,9 @@ def test_limited_wrench_keeps_its_direction(q):
 
 
 def test_force_and_torque_are_limited_separately():
-    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME_POSTURE)
+    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME_POSTURE_RAD)
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
-    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE)
+    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE_RAD)
     np.testing.assert_allclose(displayed, [0, 0, 10.0, 0.17, 0.05, 0], rtol=1e-12)
 
 
@@ -100,7 +100,7 @@ def test_command_that_is_not_finite_displays_zero(bad, index):
 def test_fault_has_its_own_port_and_a_combined_one():
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
-    start = initial_display_state(POSTURES[1], DEVICE.numbers)
+    start = initial_display_state(POSTURES[1], DEVICE.parameters)
     block.GetInputPort("for_display").FixValue(context, start)
     for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.WRENCH)):
         block.GetInputPort("wrench_command").FixValue(context, wrench)
@@ -111,10 +111,10 @@ def test_fault_has_its_own_port_and_a_combined_one():
 
 
 def test_huge_command_is_limited_and_invalid_command_is_zero():
-    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME_POSTURE)
+    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME_POSTURE_RAD)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
-    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME_POSTURE)[1], 0)
+    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME_POSTURE_RAD)[1], 0)
 
 
 WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
@@ -123,14 +123,14 @@ WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, 7) displayed wrench and fault, and (N, 6) torque, per period."""
     device, J, drive = (
-        initial_display_state(POSTURES[1], DEVICE.numbers),
+        initial_display_state(POSTURES[1], DEVICE.parameters),
         np.empty((6, 6)),
         np.empty(27),
     )
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        step_display(command, device, DEVICE.numbers, PERIOD, J, drive)
+        step_display(command, device, DEVICE.parameters, PERIOD, J, drive)
         torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque
@@ -166,6 +166,8 @@ def test_torque_returns_to_the_limit_of_the_strongest_motor():
     shown, _ = displayed_over(commands, np.tile(POSTURES[1], (2600, 1)))
     growth = np.diff(np.linalg.norm(shown[159:, 3:6], axis=1))
     assert (
-        0.0 < growth.max() <= phantom.WRIST_TORQUE_LIMIT.max() * PERIOD / RESUME_TIME_S * (1 + 1e-9)
+        0.0
+        < growth.max()
+        <= phantom.PEAK_WRIST_TORQUES_N_M.max() * PERIOD / RESUME_TIME_S * (1 + 1e-9)
     )
     np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])

@@ -54,7 +54,7 @@ def test_sdf_has_the_mass_matrix_and_coriolis_forces_of_the_device(plant):
         mass = SERIAL.T @ plant.CalcMassMatrix(context) @ SERIAL
         np.testing.assert_allclose(mass, phantom.mass_matrix(q), atol=1e-11)
         vdot = np.empty(6)
-        phantom.acceleration_into(
+        phantom.joint_acceleration_into(
             q, v, np.zeros(6), phantom.gravity_torque(q), no_friction, np.empty((2, 6, 6)), vdot
         )
         coriolis = SERIAL.T @ plant.CalcBiasTerm(context)
@@ -75,9 +75,9 @@ def test_sdf_lacks_only_the_counterweight_of_the_outer_link(plant):
 def test_sdf_has_the_limits_of_the_device(plant):
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     independent = [0, 1, 3, 4, 5]
-    np.testing.assert_allclose(lower[independent], phantom.JOINT_LOWER[independent], atol=1e-6)
-    np.testing.assert_allclose(upper[independent], phantom.JOINT_UPPER[independent], atol=1e-6)
-    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.FIVE_BAR_RANGE, atol=1e-6)
+    np.testing.assert_allclose(lower[independent], phantom.JOINT_LOWER_RAD[independent], atol=1e-6)
+    np.testing.assert_allclose(upper[independent], phantom.JOINT_UPPER_RAD[independent], atol=1e-6)
+    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.FIVE_BAR_RANGE_RAD, atol=1e-6)
     np.testing.assert_allclose(
-        plant.GetEffortUpperLimits()[3:], phantom.WRIST_TORQUE_LIMIT, atol=1e-12
+        plant.GetEffortUpperLimits()[3:], phantom.PEAK_WRIST_TORQUES_N_M, atol=1e-12
     )

@@ -27,7 +27,7 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 
-START = phantom.forward_kinematics(phantom.HOME_POSTURE)
+START = phantom.forward_kinematics(phantom.HOME_POSTURE_RAD)
 SEGMENTS = [
     MinimumJerk(t_start=0.1, duration=0.5, translation=[0.01, 0.02, -0.03], rotation=[0.3, 0, 0.2]),
     Sine(
@@ -158,7 +158,7 @@ def test_hand_yields_to_the_displayed_force(grip):
     model = Master(friction=viscous).device(hand.mass, hand.inertia)
     builder = DiagramBuilder()
     operator = builder.AddSystem(Operator(config, START))
-    master = builder.AddSystem(device.MasterDevice(period, model, phantom.HOME_POSTURE))
+    master = builder.AddSystem(device.MasterDevice(period, model, phantom.HOME_POSTURE_RAD))
     display = builder.AddSystem(ForceDisplay(period, model))
     for source, sink, port in (
         (master, operator, "pose_master"),

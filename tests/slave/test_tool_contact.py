@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, min_distance_of_boxes
+from drake_teleop.station.environment.point_contact import FindContactPairs, min_distance_of_boxes
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -131,12 +131,12 @@ def test_other_shapes_are_monitored_by_bounding_boxes():
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
     plant.Finalize()
     inspector, from_S = scene_graph.model_inspector(), RigidTransform([0.0, 0.0, 0.2])
-    pairs = ContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
-    assert len(pairs.known) == 0
-    assert "spheres on boxes only, not a Box on a Sphere" in pairs.unknown
-    np.testing.assert_allclose(pairs.watched[0, :3], [0.0, 0.3, 0.2])
-    np.testing.assert_allclose(pairs.watched[0, 16:19], 0.1)
-    np.testing.assert_allclose(np.sort(pairs.watched[0, 37:]), [0.5, 1.0, 2.0])
+    pairs = FindContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
+    assert len(pairs.compiled_pairs) == 0
+    assert "spheres on boxes only, not a Box on a Sphere" in pairs.monitoring_reason
+    np.testing.assert_allclose(pairs.monitored_pairs[0, :3], [0.0, 0.3, 0.2])
+    np.testing.assert_allclose(pairs.monitored_pairs[0, 16:19], 0.1)
+    np.testing.assert_allclose(np.sort(pairs.monitored_pairs[0, 37:]), [0.5, 1.0, 2.0])
 
 
 def test_distance_of_separate_boxes():

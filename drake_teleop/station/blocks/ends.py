@@ -67,7 +67,7 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(NUM_PORT_SIGNALS), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
-        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUTS]
+        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUT_PORTS]
         self._groups = [int(self.DeclareDiscreteState(part)) for part in results[:3]]
         step = self.DeclareCacheEntry(
             "step",
@@ -124,7 +124,7 @@ class PassivityAtMaster(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUTS = (("pose_command", 7), ("hand_wrench_E", 6))
+    _INPUT_PORTS = (("pose_command", 7), ("hand_wrench_E", 6))
 
     def _declare_outputs(self, step: Any) -> None:
         calculate = weak_callback(self._calc_wrench)
@@ -163,7 +163,7 @@ class PassivityAtSlave(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUTS = (
+    _INPUT_PORTS = (
         *(("wrench_B", 6), ("load_wrench_B", 6), ("pose_slave", 7)),
         *(("saturated", 1), ("contact", 1)),
     )

@@ -15,8 +15,12 @@ from pydrake.systems.framework import (
 
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import DISPLAYED, initial_display_state, step_display
+from drake_teleop.station.master.dynamics import HapticDeviceBase
+from drake_teleop.station.master.force_display import (
+    DISPLAYED_SLOTS,
+    initial_display_state,
+    step_display,
+)
 
 
 class ForceDisplay(DoubleOnly, LeafSystem):
@@ -41,10 +45,12 @@ class ForceDisplay(DoubleOnly, LeafSystem):
 
     __slots__ = ()
 
-    def __init__(self, device: DisplayDevice, period: float, start: ArrayLike = (0.0,) * 6) -> None:
+    def __init__(
+        self, device: HapticDeviceBase, period: float, start: ArrayLike = (0.0,) * 6
+    ) -> None:
         super().__init__()
-        self._period, self._numbers, self._jacobian = period, device.numbers, np.zeros((6, 6))
-        memory = initial_display_state(finite_array("start", start, 6), device.numbers)
+        self._period, self._parameters, self._jacobian = period, device.parameters, np.zeros((6, 6))
+        memory = initial_display_state(finite_array("start", start, 6), device.parameters)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._position = self.DeclareVectorInputPort("joint_position", 6)
         self.DeclareDiscreteState(memory)
@@ -69,7 +75,7 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         device = context.get_discrete_state(0).CopyToVector()
         device[:6] = self._position.Eval(context)
         drive, command = step.get_mutable_value(), self._command.Eval(context)
-        step_display(command, device, self._numbers, self._period, self._jacobian, drive)
+        step_display(command, device, self._parameters, self._period, self._jacobian, drive)
 
     def _display_state(self, context: Context) -> Array:
         drive: Array = self.get_cache_entry(self._step).Eval(context)
@@ -79,10 +85,10 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         output.SetFromVector(self._display_state(context)[:6])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._display_state(context)[DISPLAYED])
+        output.SetFromVector(self._display_state(context)[DISPLAYED_SLOTS])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._display_state(context)[DISPLAYED.stop]
+        output[0] = self._display_state(context)[DISPLAYED_SLOTS.stop]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._display_state(context))

@@ -74,7 +74,7 @@ class MasterDevice(DeviceBlock):
 
     def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
         check_period(device, q_initial, period)
-        constants = device.numbers, np.zeros((2, 6, 6)), np.zeros((3, 12))
+        constants = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
         super().__init__(period, device, q_initial, _advance_device, constants)
 
 

@@ -12,7 +12,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 
 @njit(cache=True)
-def read_pose_into(q, q_start, steps, device, pose):
+def encoder_pose_into(q, q_start, steps, device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
     `steps` (6,) are in m or rad; 0 disables rounding.
@@ -44,14 +44,14 @@ class Encoders(LeafSystem):
         self, device: HapticDevice, q_start: NDArray[np.float64], steps: NDArray[np.float64]
     ) -> None:
         super().__init__()
-        self._constants = q_start, steps, device.numbers
+        self._constants = q_start, steps, device.parameters
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
         self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)
 
     def _calc_rounded_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
-        read_pose_into(q, *self._constants, output.get_mutable_value())
+        encoder_pose_into(q, *self._constants, output.get_mutable_value())
 
 
 class SampleHold(LeafSystem):

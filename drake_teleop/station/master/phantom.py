@@ -29,9 +29,14 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.device_parameters import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
+from drake_teleop.station.master.device_parameters import (
+    COULOMB_SLOTS,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    VISCOUS_SLOTS,
+)
 
-GRAVITY = 9.81  # m/s^2, along -z_B
+GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 
 L1, L2, L3, L5, L6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527  # m, P
 # Mass [kg]; moments of inertia [kg m^2] about x (the pitch axis), y and z of the source, P.
@@ -47,18 +52,18 @@ WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at E, estimat
 WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, estimate
 
 #: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
-JOINT_LOWER = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
-JOINT_UPPER = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
+JOINT_LOWER_RAD = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
+JOINT_UPPER_RAD = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
 #: Range of q2 - q3 [rad], limited by the five-bar, P.
-FIVE_BAR_RANGE = (math.radians(-55.0), math.radians(65.0))
-FORCE_LIMIT = 37.5  # N, peak at the gimbal point, D
-WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
+FIVE_BAR_RANGE_RAD = (math.radians(-55.0), math.radians(65.0))
+PEAK_FORCE_N = 37.5  # N, peak at the gimbal point, D
+PEAK_WRIST_TORQUES_N_M = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
 
 #: Posture with R_BE = identity, in the middle of the workspace.
-HOME_POSTURE = np.zeros(6)
+HOME_POSTURE_RAD = np.zeros(6)
 
-# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED): a slower device creeps.
-FRICTION_SPEED = 0.01  # rad/s, estimate
+# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED_RAD_S): a slower device creeps.
+FRICTION_SPEED_RAD_S = 0.01  # rad/s, estimate
 # End stops: spring and damper that never pull, estimate: 7 kN/m at the tip.
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
@@ -84,9 +89,11 @@ _M11_Q3 = 0.5 * (
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
 _M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_MOTOR_1, _MOTOR_2, _MOTOR_3 = (gear**2 * MOTOR_INERTIA for gear in GEAR_RATIOS)
-_GRAVITY_TORQUE_2 = 0.5 * GRAVITY * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
-_GRAVITY_TORQUE_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+_MOTOR_INERTIA_1, _MOTOR_INERTIA_2, _MOTOR_INERTIA_3 = (
+    gear**2 * MOTOR_INERTIA for gear in GEAR_RATIOS
+)
+_GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 
 @njit(cache=True)
@@ -129,9 +136,9 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
-    M[0, 0] += _MOTOR_1
-    M[1, 1] += _MOTOR_2
-    M[2, 2] += _MOTOR_3
+    M[0, 0] += _MOTOR_INERTIA_1
+    M[1, 1] += _MOTOR_INERTIA_2
+    M[2, 2] += _MOTOR_INERTIA_3
     tip_mass = WRIST_MASS + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.
@@ -146,7 +153,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    weight = WRIST_MASS * GRAVITY
+    weight = WRIST_MASS * GRAVITY_M_S2
     out[0] = 0.0
     out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
     out[2] = (_GRAVITY_TORQUE_3 + weight * L2) * math.sin(q[2])
@@ -201,17 +208,17 @@ def _end_stop_torque(angle, rate, lower, upper, stiffness, damping):
 @njit(cache=True)
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
-        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED) + viscous[i] * v[i]
+        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED_RAD_S) + viscous[i] * v[i]
         stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
         damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
         torque[i] += _end_stop_torque(
-            q[i], v[i], JOINT_LOWER[i], JOINT_UPPER[i], stiffness, damping
+            q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
         )
     five_bar = _end_stop_torque(
         q[1] - q[2],
         v[1] - v[2],
-        FIVE_BAR_RANGE[0],
-        FIVE_BAR_RANGE[1],
+        FIVE_BAR_RANGE_RAD[0],
+        FIVE_BAR_RANGE_RAD[1],
         _STOP_STIFFNESS,
         _STOP_DAMPING,
     )
@@ -220,21 +227,21 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
 
 
 @njit(cache=True)
-def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
+def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `work` is scratch.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, device[HAND_MASS], device[HAND_INERTIA], M)
+    mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
     gravity_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
-    _add_friction_and_end_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
+    _subtract_coriolis(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
+    _add_friction_and_end_stops(q, v, device[COULOMB_SLOTS], device[VISCOUS_SLOTS], vdot)
     solve_by_cholesky(M, vdot, 6)
 
 
@@ -318,21 +325,21 @@ def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def is_at_end_stop(q: NDArray[np.float64]) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
-    beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
-    return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
+    beyond = ((q < JOINT_LOWER_RAD) | (q > JOINT_UPPER_RAD)).any(axis=1)
+    return beyond | (folded < FIVE_BAR_RANGE_RAD[0]) | (folded > FIVE_BAR_RANGE_RAD[1])
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
     margin = 1e-9
     for i in range(6):
-        if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:
+        if not JOINT_LOWER_RAD[i] - margin <= q[i] <= JOINT_UPPER_RAD[i] + margin:
             raise DrakeTeleopError(
                 f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
-                f"{np.degrees(JOINT_LOWER[i]):.1f} to {np.degrees(JOINT_UPPER[i]):.1f}",
+                f"{np.degrees(JOINT_LOWER_RAD[i]):.1f} to {np.degrees(JOINT_UPPER_RAD[i]):.1f}",
                 where="pose_master",
                 remedy="choose a start pose inside the device's workspace",
             )
-    if not FIVE_BAR_RANGE[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE[1] + margin:
+    if not FIVE_BAR_RANGE_RAD[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE_RAD[1] + margin:
         raise DrakeTeleopError(
             f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
             where="pose_master",

@@ -24,8 +24,8 @@ from pydrake.multibody.tree import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
-    GRAVITY_COLUMN,
     IS_PRISMATIC_COLUMN,
+    LAST_ROW_GRAVITY_COLUMN,
     NUM_TABLE_COLUMNS,
     PHI_COLUMN,
     ROTATION_COLUMN,
@@ -40,7 +40,7 @@ _DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
-_MAX_PLAUSIBLE_LIMIT = 1e4
+_MAX_PLAUSIBLE_POSITION_LIMIT = 1e4
 # Default time to full speed [s].
 _TIME_TO_FULL_SPEED_S = 0.4
 
@@ -65,7 +65,7 @@ def ArmModelFromPlant(
     inboard_joints = {
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
-    joints = _joint_chain(inboard_joints, frame_S)
+    joints = _moving_joints_to_sensor(inboard_joints, frame_S)
     n = len(joints)
     table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
@@ -73,8 +73,8 @@ def ArmModelFromPlant(
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
-    table[n, GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity.gravity_vector() * gravity.is_enabled(
-        model_instance
+    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = (
+        gravity.gravity_vector() * gravity.is_enabled(model_instance)
     )
 
     context = plant.CreateDefaultContext()
@@ -123,8 +123,8 @@ def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
     return (
-        -np.inf if lower < -_MAX_PLAUSIBLE_LIMIT else lower,
-        np.inf if upper > _MAX_PLAUSIBLE_LIMIT else upper,
+        -np.inf if lower < -_MAX_PLAUSIBLE_POSITION_LIMIT else lower,
+        np.inf if upper > _MAX_PLAUSIBLE_POSITION_LIMIT else upper,
     )
 
 
@@ -134,7 +134,7 @@ def _joint_axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     return axis
 
 
-def _joint_chain(
+def _moving_joints_to_sensor(
     inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
 ) -> list[RevoluteJoint | PrismaticJoint]:
     body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
@@ -206,7 +206,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
-def with_all_limits(
+def fill_missing_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
@@ -286,19 +286,19 @@ def _is_positive_and_finite(limits: Array) -> NDArray[np.bool_]:
     return np.isfinite(limits) & (limits > 0)
 
 
-_MIN_LENGTH_M, _MAX_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
+_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
 
 
-def check_size(arm: ArmModel, where: str) -> None:
+def check_arm_lengths(arm: ArmModel, where: str) -> None:
     """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
-    if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
+    if 0.0 < length < _MIN_ARM_LENGTH_M or length > _MAX_ARM_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI_COLUMN:], strict=True):
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
-        if distance > _MAX_LENGTH_M:
+        if distance > _MAX_ARM_LENGTH_M:
             what = f"the mass moved by {name} is {distance:.3g} m away from it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

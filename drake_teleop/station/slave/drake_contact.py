@@ -61,7 +61,7 @@ class DrakeContact(LeafSystem):
 Array = NDArray[np.float64]
 
 
-class ContactTwin:
+class ContactPlantCopy:
     """Copy of the slave's plant that computes contact at any state, beside the simulated plant."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
@@ -81,10 +81,13 @@ class ContactTwin:
         half = len(x) // 2
         if len(state):
             plant.SetPositionsAndVelocities(context, state)
-        arm, leaf = (self._slave.instance, slice(half - 1)), (contact.sheet, slice(half - 1, half))
-        for instance, own in (arm, leaf):
+        parts = {
+            self._slave.instance: slice(half - 1),
+            contact.leaf_instance: slice(half - 1, half),
+        }
+        for instance, own in parts.items():
             if instance is not None:
                 plant.SetPositions(context, instance, x[:half][own])
                 plant.SetVelocities(context, instance, x[half:][own])
         results = plant.get_contact_results_output_port().Eval(context)
-        return contact_wrench_W(results, contact.bodies, contact.shapes)
+        return contact_wrench_W(results, contact.tool_bodies, contact.tool_shapes)

@@ -16,7 +16,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.slave_config import Slave
 
 # Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
-_MIN_INERTIA_KG_M2 = 1e-9
+_MIN_MASS_MATRIX_EIGENVALUE_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
@@ -57,7 +57,7 @@ def home_posture(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
     return q
 
 
-def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
+def find_start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
     if not slave.home:
         return home_posture(arm, slave.position)
     if len(slave.home) != arm.num_joints:
@@ -81,7 +81,7 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 def check_motor_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA_KG_M2:
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
         raise DrakeTeleopError(
             "the mass matrix is singular: the links have too little inertia",
             where="slave.model",

@@ -31,7 +31,7 @@ FLANGE_OFFSET_M = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
-_SINGULAR_THRESHOLD = 1e-9
+_MAX_SINGULAR_DISTANCE_OR_SINE = 1e-9
 # Tolerance of a joint limit [rad]; the angle is clipped to the limit.
 _LIMIT_TOLERANCE_RAD = 1e-9
 
@@ -90,7 +90,7 @@ def _all_solutions_into(
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _SINGULAR_THRESHOLD:
+    if rho < _MAX_SINGULAR_DISTANCE_OR_SINE:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
@@ -119,7 +119,7 @@ def _all_solutions_into(
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _SINGULAR_THRESHOLD else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SINE else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -134,7 +134,7 @@ def _all_solutions_into(
 
 
 @njit(cache=True)
-def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
+def _wrap_angle_into_limits(angle: float, near: float, lower: float, upper: float) -> float:
     """Return the angle plus full turns that is nearest to `near` within the limits, or nan."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
@@ -165,7 +165,7 @@ def _nearest_branch_into(
     for row in range(8):
         distance = 0.0
         for i in range(6):
-            angle = _wrap_to_limits(branches[row, i], reference[i], lower[i], upper[i])
+            angle = _wrap_angle_into_limits(branches[row, i], reference[i], lower[i], upper[i])
             step = abs(angle - reference[i])
             # A nan (outside the limits) also gives inf.
             distance += step * step if step <= max_step else np.inf
@@ -175,7 +175,7 @@ def _nearest_branch_into(
     if best < 0:
         return _JOINT_LIMIT
     copy_into(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _SINGULAR_THRESHOLD:
+    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SINE:
         status = max(status, _WRIST_SINGULAR)
     return status
 
@@ -195,7 +195,7 @@ def solve_pose_command(
     return _nearest_branch_into(R, pose[4:7], reference, lower, upper, max_step, q)
 
 
-def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
+def all_ik_solutions(R_WS: Array, p_WS: Array) -> Array:
     """Return the eight solutions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
@@ -241,7 +241,7 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    At a joint limit the command stays instead of jumping to another solution, see `MAX_STEP`.
+    At a joint limit the command stays and does not jump to another solution (`MAX_JOINT_STEP_RAD`).
 
     .. pydrake_system::
 
@@ -256,7 +256,7 @@ class InverseKinematics(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    MAX_STEP = 2.0
+    MAX_JOINT_STEP_RAD = 2.0
     """Largest joint displacement [rad]; joints 4 and 6 may need 90 degrees past q5 = 0."""
 
     def __init__(self, lower: Array, upper: Array) -> None:
@@ -275,7 +275,7 @@ class InverseKinematics(LeafSystem):
             self._position.Eval(context),
             self._lower,
             self._upper,
-            self.MAX_STEP,
+            self.MAX_JOINT_STEP_RAD,
             q,
         )
 

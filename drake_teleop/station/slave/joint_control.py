@@ -66,7 +66,7 @@ class JointControlConfig:
         return 1 / (2 * np.pi * min(self.position_bandwidth_hz, self.velocity_bandwidth_hz))
 
     @property
-    def speed_gain(self) -> float:
+    def position_loop_gain_per_s(self) -> float:
         """Commanded joint speed divided by the position error [1/s]."""
         interface = self.position_interface
         return (
@@ -100,7 +100,7 @@ class JointControlConfig:
 
 
 @njit(cache=True, borrows=True)
-def joint_control_torque(
+def computed_torque_into(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
@@ -173,7 +173,7 @@ class JointControl(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        joint_control_torque(
+        computed_torque_into(
             self._arm,
             self._command.Eval(context),
             self._state.Eval(context),
@@ -214,7 +214,7 @@ def MakeJointControl(
     return PositionServo(arm, interface, period, q_start)
 
 
-def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
+def position_interface_of_block(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the position interface that `servo` in a `joint_control` block names, or None."""
     return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 

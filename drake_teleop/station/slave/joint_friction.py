@@ -16,14 +16,14 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 Array = NDArray[np.float64]
 
-FRICTION_SPEED = 2e-3
+FRICTION_TANH_SPEED = 2e-3
 """Speed v_0 of the friction law [rad/s, m/s], estimate."""
 
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
     """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
-    return -coulomb * np.tanh(speed / FRICTION_SPEED)
+    return -coulomb * np.tanh(speed / FRICTION_TANH_SPEED)
 
 
 @njit(cache=True)
@@ -34,7 +34,7 @@ def _friction_into(coulomb, index, state, force):
         force[index[i]] = dry_friction(coulomb[i], state[n + i])
 
 
-def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
+def expand_friction_per_joint(values: list[float], joints: tuple[str, ...]) -> Array:
     """Return friction torques (n,) [N m] from 0, 1 or n values, else raise DrakeTeleopError."""
     n = len(joints)
     if len(values) not in (0, 1, n):

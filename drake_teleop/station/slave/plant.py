@@ -24,11 +24,15 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_kinematics, pose_into
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
+from drake_teleop.station.slave.arm_from_plant import (
+    ArmModelFromPlant,
+    check_arm_lengths,
+    fill_missing_limits,
+)
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, start_posture
-from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
+from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, find_start_posture
+from drake_teleop.station.slave.joint_friction import AddJointFriction, expand_friction_per_joint
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
@@ -75,8 +79,8 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs of shapes (k, 28) that the compiled contact law covers, `ShapePairs.known`."""
-        return self.contact.pairs
+        """Pairs of shapes (k, 28) of the compiled contact law, `ShapePairs.compiled_pairs`."""
+        return self.contact.compiled_pairs
 
     @cached_property
     def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
@@ -88,26 +92,27 @@ class SlavePlant:
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
-        contact = self.contact.pairs, self.contact.leaf, self.contact.joints
-        return carried.table, carried.load, *contact, np.zeros((0, 0))
+        contact, no_wrenches = self.contact, np.zeros((0, 0))
+        laws = contact.compiled_pairs, contact.leaf_parameters, contact.joint_table
+        return carried.table, carried.phi_load_view, *laws, no_wrenches
 
     @property
     def joint_friction(self) -> NDArray[np.float64]:
-        return friction_of_joints(self.config.friction, self.arm.joint_names)
+        return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
 
     @property
     def sheet_instance(self) -> ModelInstanceIndex | None:
         """Model instance of the sheet spring's leaf or another `moving_part`, or None."""
-        return self.contact.sheet
+        return self.contact.leaf_instance
 
     @property
     def can_touch(self) -> bool:
-        return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
+        return len(self.contact_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
-    def sheet_in_compiled_law(self) -> ModelInstanceIndex | None:
+    def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
         """`sheet_instance` if the compiled contact law computes its contact, else None."""
-        return None if self.contact.beyond else self.sheet_instance
+        return None if self.contact.drake_contact_reason else self.sheet_instance
 
     @property
     def start_tip(self) -> NDArray[np.float64]:
@@ -174,13 +179,13 @@ def AddSlavePlant(
     if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_arm_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
+        _remove_arm_shapes(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
-    start = start_posture(slave, arm) if q_start is None else q_start
+    start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         check_motor_strength(arm, start)
-    friction = friction_of_joints(slave.friction, arm.joint_names)
+    friction = expand_friction_per_joint(slave.friction, arm.joint_names)
     if friction.any():
         AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
     plant.SetDefaultPositions(instance, start)
@@ -213,7 +218,7 @@ class ParsedSlave:
     sensor_frame: Frame
     tool: BodyIndex
     assumptions: tuple[str, ...]
-    folders: list[TemporaryDirectory[str]]
+    mesh_folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
         """Return the arm, after the plant is finalized, and the assumptions about its limits."""
@@ -225,8 +230,8 @@ class ParsedSlave:
                 where="slave.tool",
                 remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
             )
-        check_size(arm, str(self.slave.path))
-        arm, assumed = with_all_limits(arm, str(self.slave.path))
+        check_arm_lengths(arm, str(self.slave.path))
+        arm, assumed = fill_missing_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
             assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
@@ -244,12 +249,12 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         )
     plant.RenameModelInstance(model.instance, ARM_INSTANCE_NAME)
     set_torque_limits(plant, model.instance, slave.torque_limits)
-    frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
-    assumptions, folders = [*model.assumptions], [model.folder]
+    frame, model_bodies = model.sensor_frame, bodies_carried_by(plant, model.sensor_frame.body())
+    assumptions, folders = [*model.assumptions], [model.mesh_folder]
     if slave.tool is not None:
         tool = AddTool(plant, slave.tool, frame, slave.package_folders)
         assumptions += tool.assumptions
-        folders += [tool.folder] if tool.folder is not None else []
+        folders += [tool.mesh_folder] if tool.mesh_folder is not None else []
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
             assumptions.append(f"{names} of the model on the sensor beside the tool")
@@ -262,11 +267,11 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     )
 
 
-def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
     """Return the bodies that a body carries through joints, the nearest first."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
-    return near + [far for each in near for far in bodies_beyond(plant, each)]
+    return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
 def finalize_plant(plant: MultibodyPlant) -> None:
@@ -296,13 +301,13 @@ def _remove_arm_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hull_corners_on_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
+def _hull_corners_beyond_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
     context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
     hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
-    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
+    for body in bodies_carried_by(plant, parsed.sensor_frame.body()):
         X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
         for shape in plant.GetCollisionGeometriesForBody(body):
             X_SShape = X_SBody @ inspector.GetPoseInFrame(shape)
@@ -340,13 +345,13 @@ def _tip_of_tool(
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hull_corners_on_sensor_S(slave)):
+    if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
         return _farthest_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class ArmKinematics:
     """Kinematics of an arm: joint names from the base outwards, and `ArmModel.table`."""
 
     joint_names: tuple[str, ...]
@@ -359,13 +364,15 @@ class Arm:
         return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
 
 
-def arm_of_model_file(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
+def read_arm_kinematics(
+    model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
+) -> ArmKinematics:
     """Return the kinematics of the arm in a model file, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
         finalize_plant(plant)
         found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
-    arm = Arm(found.joint_names, found.table)
+    arm = ArmKinematics(found.joint_names, found.table)
     arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
     return arm

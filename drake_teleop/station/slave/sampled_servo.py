@@ -18,7 +18,7 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
-    joint_control_torque,
+    computed_torque_into,
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
@@ -44,7 +44,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 
 @njit(cache=True)
-def torque_line_into(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
+def predict_torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
     """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
@@ -67,7 +67,7 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
     for k in range(samples):
         copy_into(predicted, 0, x, 0, n)
         copy_into(predicted, n, x, n + 1, n)
-        joint_control_torque(
+        computed_torque_into(
             arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
         )
         for i in range(n):
@@ -125,7 +125,7 @@ class SampledServo(LeafSystem):
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
-        if slave.sheet_in_compiled_law is not None:
+        if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, q_start)
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
@@ -145,7 +145,7 @@ class SampledServo(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
-        torque_line_into(
+        predict_torque_line(
             self._arm,
             self._command.Eval(context),
             self._state.Eval(context),

@@ -59,7 +59,7 @@ class Block:
         return Box(*self.edges)
 
     @property
-    def half_height(self) -> float:
+    def half_extent_along_z(self) -> float:
         """Distance along z_S from the centre to the farthest corner [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
@@ -115,7 +115,7 @@ def end_of_tool_shapes(tool: Tool) -> list[float] | None:
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
-        for half in [each.radius if isinstance(each, Ball) else each.half_height]
+        for half in [each.radius if isinstance(each, Ball) else each.half_extent_along_z]
     ]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
 

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
@@ -21,7 +21,7 @@ _INERTIA_ENTRIES = {
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
-_MIN_CHANGE_KG_M2 = 1e-15  # changes below this are rounding
+_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
 _TRIANGLE_INEQUALITY_MARGIN = 1e-9
 
@@ -45,10 +45,10 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     text = _mass_text(inertial)
     mass, inertia = parse_number(text), _inertia_tensor_of(inertial, is_sdf=is_sdf)
     fault = ""
-    if not 0.0 <= mass <= MAX_VALUE:
-        fault = f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
-    elif not (np.abs(inertia) <= MAX_VALUE).all():
-        fault = f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
+    if not 0.0 <= mass <= MAX_SI_VALUE:
+        fault = f"mass {text} kg is not between 0 and {MAX_SI_VALUE:g} kg"
+    elif not (np.abs(inertia) <= MAX_SI_VALUE).all():
+        fault = f"an entry of its inertia is no number up to {MAX_SI_VALUE:g} kg m^2"
     no_mass = not fault and mass == 0.0
     if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
@@ -59,7 +59,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     else:
         if no_mass and inertia.any():
             report.state_repair("an inertia without a mass left out of", name)
-        nearest = np.zeros((3, 3)) if no_mass else possible_inertia(inertia, name, report)
+        nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
         link.remove(inertial)
         _write_inertial(
             link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
@@ -83,12 +83,12 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64
     return tensor
 
 
-def possible_inertia(
+def correct_impossible_inertia(
     inertia: NDArray[np.float64], name: str, report: RepairReport
 ) -> NDArray[np.float64]:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _MIN_CHANGE_KG_M2:
+    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _ROUNDING_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MAX_VALUE,
+    MAX_SI_VALUE,
     MIN_VECTOR_LENGTH,
     Attributes,
     Mjcf,
@@ -96,7 +96,7 @@ def takes_part_in_contacts(shape: Attributes) -> bool:
 
 @dataclass(eq=False)
 class Body:
-    """Body with pose X_PB in its parent; `generators` are tags that this package cannot read."""
+    """Body with pose X_PB in its parent; `generator_tags` are tags that are not supported."""
 
     name: str
     X_PB: RigidTransform
@@ -105,7 +105,7 @@ class Body:
     sites: dict[str, RigidTransform] = field(default_factory=dict)
     children: list[Body] = field(default_factory=list)
     inertial: MassProperties | None = None
-    generators: list[str] = field(default_factory=list)
+    generator_tags: list[str] = field(default_factory=list)
     is_auxiliary: bool = False  # a body that the file does not have
 
     def with_descendants(self) -> list[Body]:
@@ -128,7 +128,7 @@ class BodyReader:
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
-    def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
+    def remove_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
         """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
         found = []
 
@@ -189,7 +189,7 @@ class BodyReader:
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
             elif child.tag in _GENERATOR_TAGS:
-                body.generators.append(child.tag)
+                body.generator_tags.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
         name = given.get("name") or self._make_unused_name(f"{body.name}_joint")
@@ -212,7 +212,8 @@ class BodyReader:
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
-        X_FG, size = self._mjcf.read_pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
+        X_FG = self._mjcf.read_pose(given)
+        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_SI_VALUE)
         if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))

@@ -19,10 +19,10 @@ from drake_teleop.station.slave.model.repair_report import RepairReport
 _MAX_NESTING_DEPTH = 150  # largest depth of nested elements
 MIN_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
-MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
+MAX_SI_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
-_EXTENDABLE_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+_COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
 _ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
 _ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
@@ -54,8 +54,11 @@ class Attributes(dict[str, str]):
     def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
         """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
-        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
-            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
+        if (
+            len(self.get(name, "").split()) not in (0, count)
+            or max(map(abs, values)) > MAX_SI_VALUE
+        ):
+            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_SI_VALUE:g}"
             self._report.add_fault(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)
@@ -201,7 +204,7 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _EXTENDABLE_ATTRIBUTES else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _COMPLETED_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 

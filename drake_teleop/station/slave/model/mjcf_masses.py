@@ -41,7 +41,7 @@ def combine_properties(parts: list[MassProperties]) -> MassProperties:
     centre = sum((part.mass * part.centre for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
-        inertia += part.inertia + part.mass * _inertia_of_unit_point(part.centre - centre)
+        inertia += part.inertia + part.mass * _inertia_of_unit_mass_at(part.centre - centre)
     return MassProperties(mass, centre, inertia)
 
 
@@ -134,5 +134,5 @@ def _tetrahedron_volumes(corners: _Array, mode: str) -> _Array:
     return np.abs(volume) if mode == "legacy" else volume
 
 
-def _inertia_of_unit_point(p: _Array) -> _Array:
+def _inertia_of_unit_mass_at(p: _Array) -> _Array:
     return np.asarray(p @ p * np.eye(3) - np.outer(p, p))

@@ -85,7 +85,7 @@ class MeshLibrary:
         for element in mjcf.elements_in("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
             attributes = mjcf.attributes_of(element, "", label)
-            file, fault = self._load_mesh(element, attributes)
+            file, fault = self._find_mesh_file(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
@@ -101,7 +101,7 @@ class MeshLibrary:
                 self._meshes[name] = mesh = f"{suffix}{_UNREADABLE_FAULT}"
         return mesh
 
-    def _load_mesh(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
+    def _find_mesh_file(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         name = attributes.get("file", "")
         if not name:
             return None, "" if "vertex" in attributes else _UNREADABLE_FAULT

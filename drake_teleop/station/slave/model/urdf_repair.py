@@ -54,7 +54,7 @@ class ModelPurpose(NamedTuple):
     is_tool: bool = False
     is_scene: bool = False
     in_directives: bool = False
-    has_geometry: bool = True
+    plant_has_shapes: bool = True
 
 
 def repair_urdf(
@@ -71,7 +71,9 @@ def repair_urdf(
     repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
         _remove_unused_elements(root, report)
-    return finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
+    return convert_meshes_and_write_text(
+        root, file, files, report, folder if purpose.plant_has_shapes else None
+    )
 
 
 def repair_links_and_joints(
@@ -82,7 +84,7 @@ def repair_links_and_joints(
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _make_names_unique(scope, report)
-    tree = _model_tree_of_scopes(scopes, purpose, report)
+    tree = _reduce_model_to_arm(scopes, purpose, report)
     chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
@@ -99,13 +101,13 @@ def repair_links_and_joints(
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
                 check_quantities(part, f"link {name}", report)
-            at_rest = tree is not None and tree.moved.get(name) == 0
+            at_rest = tree is not None and tree.num_joints_to_link.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
 
 
-def finish_repair(
+def convert_meshes_and_write_text(
     root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
     """Convert meshes and return the text, or raise one DrakeTeleopError about all faults.
@@ -124,10 +126,10 @@ def finish_repair(
     }
     text = ElementTree.tostring(root, encoding="unicode")
     limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
-    return RepairedModel(text, report.assumptions, limits, dependent_joints(root))
+    return RepairedModel(text, report.assumptions, limits, find_dependent_parts(root))
 
 
-def dependent_joints(root: Element) -> dict[str, str]:
+def find_dependent_parts(root: Element) -> dict[str, str]:
     """Return the joints and links that do not move independently, with the reasons."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
@@ -139,7 +141,7 @@ def dependent_joints(root: Element) -> dict[str, str]:
     return found
 
 
-def _model_tree_of_scopes(
+def _reduce_model_to_arm(
     scopes: list[Element], purpose: ModelPurpose, report: RepairReport
 ) -> ModelTree | None:
     if purpose.is_tool:
