@@ -359,7 +359,10 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
         stand = part.floor_stand
         if stand is not None and stand.height > 0:
-            size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
+            size, centre = (
+                (stand.size_x, stand.size_y, stand.height),
+                (stand.centre_x, stand.centre_y),
+            )
             draw_box(
                 f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
             )

@@ -52,7 +52,7 @@ def main_gravity(q) -> np.ndarray:
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
-    weight = phantom.WRIST_MASS * phantom.GRAVITY_M_S2
+    weight = phantom.WRIST_MASS_KG * phantom.GRAVITY_M_S2
     height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
     return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
 

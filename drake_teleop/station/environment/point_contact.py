@@ -51,8 +51,8 @@ class ShapePairs(NamedTuple):
             of W if it moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
             moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
             and dynamic friction, 26 slip speed [m/s], 27 row of the body in the joint table, or -1.
-        monitored_pairs: (l, 40), bounding boxes of the other pairs. As above, with 0-2 centre of the
-            tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
+        monitored_pairs: (l, 40), bounding boxes of the other pairs. As above, with 0-2 centre of
+            the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
         monitoring_reason: why the first pair of `monitored_pairs` is not in `compiled_pairs`.
     """
 

@@ -47,9 +47,9 @@ INERTIA_BE = (11.09e-4, 10.06e-4, 0.591e-4)
 INERTIA_DF = (7.11e-4, 0.629e-4, 6.246e-4)
 INERTIA_BASE_YY = 11.87e-4
 GEAR_RATIOS = (13.3, 11.2, 11.2)  # P
-MOTOR_INERTIA = 1.08e-6  # kg m^2, P
-WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at E, estimate
-WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, estimate
+MOTOR_INERTIA_KG_M2 = 1.08e-6  # kg m^2, P
+WRIST_MASS_KG = 0.15  # kg, three links, each with its centre of mass at E, estimate
+WRIST_LINK_INERTIA_KG_M2 = 5e-5  # kg m^2, each wrist link, about every axis, estimate
 
 #: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
 JOINT_LOWER_RAD = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
@@ -90,7 +90,7 @@ _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
 _M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
 _MOTOR_INERTIA_1, _MOTOR_INERTIA_2, _MOTOR_INERTIA_3 = (
-    gear**2 * MOTOR_INERTIA for gear in GEAR_RATIOS
+    gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS
 )
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
 _GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
@@ -139,10 +139,10 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     M[0, 0] += _MOTOR_INERTIA_1
     M[1, 1] += _MOTOR_INERTIA_2
     M[2, 2] += _MOTOR_INERTIA_3
-    tip_mass = WRIST_MASS + hand_mass
+    tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.
-        carried = WRIST_INERTIA * (6 - max(j, 3)) + hand_inertia
+        carried = WRIST_LINK_INERTIA_KG_M2 * (6 - max(j, 3)) + hand_inertia
         for i in range(j + 1):
             value = carried * (J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j])
             value += tip_mass * (J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j])
@@ -153,7 +153,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    weight = WRIST_MASS * GRAVITY_M_S2
+    weight = WRIST_MASS_KG * GRAVITY_M_S2
     out[0] = 0.0
     out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
     out[2] = (_GRAVITY_TORQUE_3 + weight * L2) * math.sin(q[2])
@@ -174,7 +174,7 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
-    tip_mass = WRIST_MASS + hand_mass
+    tip_mass = WRIST_MASS_KG + hand_mass
     radial = -L1 * c2 * v[1] ** 2 - L2 * s3 * v[2] ** 2 - (L1 * c2 + L2 * s3) * v[0] ** 2
     tangential = 2.0 * (-L1 * s2 * v[1] + L2 * c3 * v[2]) * v[0]
     fx = tip_mass * (c1 * radial - s1 * tangential)
@@ -191,7 +191,7 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
         alpha = plus(alpha, cross(omega, turn))
         omega = plus(omega, turn)
         if k >= 3:
-            inertia = WRIST_INERTIA + (hand_inertia if k == 5 else 0.0)
+            inertia = WRIST_LINK_INERTIA_KG_M2 + (hand_inertia if k == 5 else 0.0)
             for i in range(k + 1):
                 torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
 

@@ -30,7 +30,7 @@ from drake_teleop.station.master.device_parameters import (
 # Coulomb friction is proportional to tanh(speed / FRICTION_SPEED_M_S): a slower device creeps.
 FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
 # End stops: spring and damper that never pull, estimate.
-_STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
+_STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M = 5000.0, 20.0  # N/m, N s/m
 _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
 
@@ -89,7 +89,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         beyond = _penetration_into_end_stop(
             q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
         )
-        stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.

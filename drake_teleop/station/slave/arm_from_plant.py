@@ -35,8 +35,8 @@ from drake_teleop.station.slave.arm import (
     Array,
 )
 
-# Default speed of a revolute joint [rad/s]; half range and speed of a prismatic one [m, m/s].
-_DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
+_DEFAULT_SPEED_RAD_S = np.pi
+_DEFAULT_HALF_RANGE_M, _DEFAULT_SPEED_M_S = 1.0, 1.0  # of a prismatic joint
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
@@ -217,7 +217,7 @@ def fill_missing_limits(
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_range`
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_limits`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -227,7 +227,7 @@ def fill_missing_limits(
             where=where,
             remedy="correct the limits, or make the joint a fixed one",
         )
-    reach, slide_speed = _DEFAULT_PRISMATIC
+    reach = _DEFAULT_HALF_RANGE_M
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
@@ -236,7 +236,7 @@ def fill_missing_limits(
         np.where(half_limited & np.isinf(lower), upper - width, lower),
         np.where(half_limited & np.isinf(upper), lower + width, upper),
     )
-    speed = np.where(slides, slide_speed, _DEFAULT_SPEED_RAD_S)
+    speed = np.where(slides, _DEFAULT_SPEED_M_S, _DEFAULT_SPEED_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit
@@ -268,7 +268,7 @@ def fill_missing_limits(
         (
             ~_is_positive_and_finite(arm.velocity_limit),
             f"a speed limit of {_DEFAULT_SPEED_RAD_S:.4g} rad/s",
-            f"a speed limit of {_DEFAULT_PRISMATIC[1]:g} m/s",
+            f"a speed limit of {_DEFAULT_SPEED_M_S:g} m/s",
         ),
         (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
