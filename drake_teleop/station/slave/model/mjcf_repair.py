@@ -52,17 +52,17 @@ def repair_mjcf(
         if np.abs(np.subtract(gravity, _DRAKE_GRAVITY_M_S2)).max() > _GRAVITY_TOLERANCE_M_S2:
             report.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.in_directives
-    if is_complete or not purpose.sensor:
+    if is_complete or not purpose.sensor_name:
         world = read_whole_world(reader)
         chain = world.with_descendants() if is_complete else []
     else:
-        world = read_world_with_arm(mjcf, reader, purpose.sensor)
-        chain = world.path_to(purpose.sensor)
+        world = read_world_with_arm(mjcf, reader, purpose.sensor_name)
+        chain = world.path_to(purpose.sensor_name)
     if is_complete:
         moving = [(body, joint) for body in chain for joint in body.joints]
         report_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = hold_joints(world, chain, purpose.hold, mjcf)
+        moving = hold_joints(world, chain, purpose.held_positions, mjcf)
         check_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()

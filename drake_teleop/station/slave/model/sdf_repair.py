@@ -33,7 +33,7 @@ def repair_sdf(
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
-        _keep_model_with_sensor(root, file, files, purpose.sensor, report)
+        _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
         for element in list(root.iter()):
             allowed = _READABLE_CHILD_TAGS.get(element.tag)
             for child in list(element) if allowed else ():

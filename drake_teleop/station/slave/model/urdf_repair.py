@@ -41,16 +41,16 @@ class ModelPurpose(NamedTuple):
     """Use of a model: as arm, tool or surroundings.
 
     Attributes:
-        sensor: frame, link or site of the sensor; empty for tools and surroundings.
-        hold: angles or positions [rad, m] of joints that do not move.
+        sensor_name: frame, link or site of the sensor; empty for tools and surroundings.
+        held_positions: angles or positions [rad, m] of joints that do not move.
         is_tool: whether the model is a tool, whose joints are all fixed.
         is_scene: whether the model is surroundings: all its shapes must be readable.
         in_directives: whether model directives add the model, so that every link is kept.
         has_geometry: whether the plant has shapes.
     """
 
-    sensor: str = ""
-    hold: dict[str, float] = {}  # noqa: RUF012  (never changed)
+    sensor_name: str = ""
+    held_positions: dict[str, float] = {}  # noqa: RUF012  (never changed)
     is_tool: bool = False
     is_scene: bool = False
     in_directives: bool = False
@@ -89,10 +89,10 @@ def repair_links_and_joints(
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
         for joint in list_joints(scope):
-            if joint.get("name") in purpose.hold:
+            if joint.get("name") in purpose.held_positions:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
-            in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
+            in_chain = id(joint) in chain and joint.get("name") not in purpose.held_positions
             check_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
@@ -150,8 +150,8 @@ def _reduce_model_to_arm(
         return None
     if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
         return None
-    link = link_of_frame(scopes[0], purpose.sensor) if purpose.sensor else ""
-    return reduce_to_chain(scopes[0], link, set(purpose.hold), report) if link else None
+    link = link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
+    return reduce_to_chain(scopes[0], link, set(purpose.held_positions), report) if link else None
 
 
 def _make_names_unique(scope: Element, report: RepairReport) -> None:
