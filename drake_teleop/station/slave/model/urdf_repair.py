@@ -46,7 +46,7 @@ class ModelPurpose(NamedTuple):
         is_tool: whether the model is a tool, whose joints are all fixed.
         is_scene: whether the model is surroundings: all its shapes must be readable.
         in_directives: whether model directives add the model, so that every link is kept.
-        has_geometry: whether the plant has shapes.
+        plant_has_shapes: whether the plant has shapes.
     """
 
     sensor_name: str = ""
