@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -23,6 +22,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     cross,
@@ -33,8 +33,6 @@ from drake_teleop.common.vectors import (
     scale_vector,
     vector_at,
 )
-
-Array = NDArray[np.float64]
 
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 (

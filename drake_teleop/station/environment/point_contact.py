@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
@@ -20,6 +19,7 @@ from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     dot,
@@ -31,8 +31,6 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-
-Array = NDArray[np.float64]
 
 #: Columns of `ShapePairs.compiled_pairs`: stiffness; both frictions; row of the box's body.
 STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_ROW_COLUMN = 22, slice(24, 26), 27

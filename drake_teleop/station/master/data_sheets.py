@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.device_parameters import (
     COULOMB_SLOTS,
@@ -185,7 +185,7 @@ class Master:
                 remedy="set it to pose: the rendered force is the same",
             )
 
-    def encoder_steps(self) -> NDArray[np.float64]:
+    def encoder_steps(self) -> Array:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
         if self.model in (PHANTOM_NAME, LEADER_NAME):
             return np.zeros(6)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
 from drake_teleop.station.master.device_parameters import (
@@ -90,7 +91,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
 class HapticDeviceBase:
     """Base class of haptic devices; `parameters` are the parameters of `device_parameters`."""
 
-    parameters: NDArray[np.float64]
+    parameters: Array
 
     @property
     def peak_force(self) -> float:
@@ -98,7 +99,7 @@ class HapticDeviceBase:
         return float(self.parameters[PEAK_FORCE_SLOT])
 
     @property
-    def peak_torque(self) -> NDArray[np.float64]:
+    def peak_torque(self) -> Array:
         """Largest displayed torques (3,) about the rotational axes [N m]."""
         return self.parameters[PEAK_TORQUE_SLOTS]
 
@@ -110,7 +111,7 @@ class HapticDevice(HapticDeviceBase):
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """
 
-    parameters: NDArray[np.float64]
+    parameters: Array
     name: str = "phantom_premium_15"
 
     num_joints = 6
@@ -119,43 +120,43 @@ class HapticDevice(HapticDeviceBase):
     def friction_field(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
-    def coordinates_for_display(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coordinates_for_display(self, q: Array) -> Array:
         return q
 
     @property
     def is_phantom(self) -> bool:
         return not self.parameters[IS_IN_TASK_SPACE_SLOT]
 
-    def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inverse_kinematics(self, pose: Array) -> Array:
         """Return the joint positions (6,) for a stylus pose X_BE (7,)."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.parameters)
 
-    def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def forward_kinematics(self, q: Array) -> Array:
         """Return the stylus pose X_BE (7,) at the joint positions q (6,)."""
         pose = np.empty(7)
         pose_into(q, self.parameters, pose)
         return pose
 
-    def check_limits(self, q: NDArray[np.float64]) -> None:
+    def check_limits(self, q: Array) -> None:
         if self.is_phantom:
             phantom.check_limits(q)
         else:
             task_space.check_limits(q, self.parameters)
 
-    def is_at_end_stop(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         """Return for each row of q (N, 6) whether an end stop is active."""
         if self.is_phantom:
             return phantom.is_at_end_stop(q)
         return task_space.is_at_end_stop(q, self.parameters)
 
-    def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, q: Array) -> Array:
         J = np.empty((6, 6))
         jacobian_into(q, self.parameters, J)
         return J
 
-    def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mass_matrix(self, q: Array) -> Array:
         """Return the mass matrix (6, 6), including the hand."""
         if self.is_phantom:
             return phantom.mass_matrix(
@@ -165,7 +166,7 @@ class HapticDevice(HapticDeviceBase):
         task_space.mass_matrix_into(q, self.jacobian(q), self.parameters, M)
         return M
 
-    def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
+    def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
         """Return the damping matrix D (6, 6): the joint forces are -D dq/dt.
 
         With `creeping`, D includes the slope of the Coulomb friction at standstill.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 
@@ -40,9 +40,7 @@ class Encoders(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(
-        self, device: HapticDevice, q_start: NDArray[np.float64], steps: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, device: HapticDevice, q_start: Array, steps: Array) -> None:
         super().__init__()
         self._constants = q_start, steps, device.parameters
         self._state = self.DeclareVectorInputPort("master_state", 12)
@@ -68,7 +66,7 @@ class SampleHold(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, start: NDArray[np.float64]) -> None:
+    def __init__(self, period: float, start: Array) -> None:
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))

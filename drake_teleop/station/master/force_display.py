@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
 from drake_teleop.station.master.dynamics import (
@@ -48,9 +48,7 @@ def _peak_wrench_of_device(parameters):
     return np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
 
 
-def initial_display_state(
-    q: NDArray[np.float64], parameters: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def initial_display_state(q: Array, parameters: Array) -> Array:
     display = np.zeros(_MONITOR_SLOTS.stop)
     display[_POSITIONS_SLOTS] = display[_LAST_POSITIONS_SLOTS] = q
     display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
@@ -141,7 +139,7 @@ class DeviceBlock(LeafSystem):
         self,
         period: float,
         device: Any,
-        q_initial: NDArray[np.float64],
+        q_initial: Array,
         advance: Callable[..., None],
         constants: tuple[Any, ...],
     ) -> None:

@@ -15,6 +15,7 @@ from pydrake.systems.framework import BasicVector, Context
 from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
 from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
 from drake_teleop.station.master.dynamics import HapticDeviceBase
@@ -32,8 +33,6 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-
-Array = NDArray[np.float64]
 
 # Rows of `LeaderDevice.joint_table`.
 (

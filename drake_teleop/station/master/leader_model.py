@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.master.device_parameters import (
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
@@ -33,7 +33,6 @@ from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
-Array = NDArray[np.float64]
 JOINT_MODE = "joints"
 
 

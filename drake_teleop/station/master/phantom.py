@@ -21,6 +21,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     cross,
     dot,
@@ -266,33 +267,31 @@ def pose_into(q, pose):
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
 
 
-def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def jacobian(q: Array) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
     return J
 
 
-def mass_matrix(
-    q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
-) -> NDArray[np.float64]:
+def mass_matrix(q: Array, hand_mass: float = 0.0, hand_inertia: float = 0.0) -> Array:
     M = np.empty((6, 6))
     mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
     return M
 
 
-def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def gravity_torque(q: Array) -> Array:
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
 
 
-def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def forward_kinematics(q: Array) -> Array:
     pose = np.empty(7)
     pose_into(q, pose)
     return pose
 
 
-def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_kinematics(pose: Array) -> Array:
     """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees."""
     x, y, z = pose[4:7]
     reach = math.hypot(x, y)
@@ -316,20 +315,20 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return q
 
 
-def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def serial_joint_angles(q: Array) -> Array:
     """Return the joint angles of `phantom.sdf` for q (..., 6): its third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
 
 
-def is_at_end_stop(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_at_end_stop(q: Array) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER_RAD) | (q > JOINT_UPPER_RAD)).any(axis=1)
     return beyond | (folded < FIVE_BAR_RANGE_RAD[0]) | (folded > FIVE_BAR_RANGE_RAD[1])
 
 
-def check_limits(q: NDArray[np.float64]) -> None:
+def check_limits(q: Array) -> None:
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER_RAD[i] - margin <= q[i] <= JOINT_UPPER_RAD[i] + margin:

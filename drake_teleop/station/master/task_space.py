@@ -14,6 +14,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross, plus, scale_vector
 from drake_teleop.station.master.device_parameters import (
     COULOMB_SLOTS,
@@ -137,9 +138,7 @@ def pose_into(q, pose):
         pose[4 + i] = q[i]
 
 
-def damping_matrix(
-    q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
-) -> NDArray[np.float64]:
+def damping_matrix(q: Array, device: Array, creeping: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S])
@@ -147,9 +146,7 @@ def damping_matrix(
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
 
-def inverse_kinematics(
-    pose: NDArray[np.float64], device: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def inverse_kinematics(pose: Array, device: Array) -> Array:
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -157,21 +154,19 @@ def inverse_kinematics(
     return q
 
 
-def _is_outside(
-    q: NDArray[np.float64], device: NDArray[np.float64], margin: float
-) -> NDArray[np.bool_]:
+def _is_outside(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
     centre = np.append(device[WORKSPACE_CENTRE_SLOTS], np.zeros(3))
     half = np.append(device[HALF_WORKSPACE_SLOTS], device[MAX_ROTATION_SLOTS])
     return np.abs(q - centre) > half + margin
 
 
-def is_at_end_stop(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_at_end_stop(q: Array, device: Array) -> NDArray[np.bool_]:
     return (
         _is_outside(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION_SLOTS] > 0.0)
     ).any(axis=1)
 
 
-def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
+def check_limits(q: Array, device: Array) -> None:
     if _is_outside(q, device, 1e-9).any():
         low, high = (
             device[WORKSPACE_CENTRE_SLOTS] - device[HALF_WORKSPACE_SLOTS],

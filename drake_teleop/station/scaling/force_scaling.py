@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     matrix_as_tuple,
@@ -120,12 +120,12 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
 
 
 def wrench_to_master(
-    wrench_S: NDArray[np.float64],
-    R_WS: NDArray[np.float64],
-    R_WB: NDArray[np.float64],
+    wrench_S: Array,
+    R_WS: Array,
+    R_WB: Array,
     force_scale: float,
     torque_scale: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the wrench to render (..., 6), the scaled reaction to the sensor's wrench: F_E_B.
 
     It is [f; tau] on the hand at the grip E, in B [N, N m].
@@ -259,14 +259,14 @@ class ForceScaling(LeafSystem):
         self,
         config: ForceScalingConfig,
         arm: ArmModel,
-        R_WB: NDArray[np.float64],
-        largest_wrench: NDArray[np.float64] | None = None,
+        R_WB: Array,
+        largest_wrench: Array | None = None,
         oldest: float = MAX_SAMPLE_AGE_S,
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
         self._valid_range = np.append(largest, oldest)
-        self._gripper: NDArray[np.float64] | None = None
+        self._gripper: Array | None = None
         if config.gripper_phi is not None:
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)

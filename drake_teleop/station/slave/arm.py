@@ -14,6 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     add_cross_product,
     add_into,
@@ -30,8 +31,6 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.station.slave.joint_friction import dry_friction
-
-Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
 (

@@ -22,6 +22,7 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     IS_PRISMATIC_COLUMN,
@@ -32,7 +33,6 @@ from drake_teleop.station.slave.arm import (
     ROTOR_COLUMN,
     TRANSLATION_COLUMN,
     ArmModel,
-    Array,
 )
 
 _DEFAULT_SPEED_RAD_S = np.pi

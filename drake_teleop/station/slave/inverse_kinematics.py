@@ -11,15 +11,13 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, forward_kinematics
-
-Array = NDArray[np.float64]
 
 SHOULDER_HEIGHT_M = 0.420
 """Base to shoulder [m]."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
@@ -19,8 +19,6 @@ from drake_teleop.station.slave.inverse_kinematics import (
     has_closed_form,
 )
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
-
-Array = NDArray[np.float64]
 
 AUTOMATIC_IK_METHOD = "automatic"
 """Name that selects the closed form where it exists, otherwise the numeric method."""

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import (
     ArmModel,
@@ -26,8 +26,6 @@ from drake_teleop.station.slave.position_servo import (
     PositionInterface,
     PositionServo,
 )
-
-Array = NDArray[np.float64]
 
 COMPUTED_TORQUE_NAME = "computed_torque"
 

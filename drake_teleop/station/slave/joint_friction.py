@@ -13,8 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
 
 FRICTION_TANH_SPEED = 2e-3
 """Speed v_0 of the friction law [rad/s, m/s], estimate."""

@@ -8,11 +8,11 @@ sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     copy_into,
@@ -33,8 +33,6 @@ from drake_teleop.station.slave.arm import (
     solve_positive_definite,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
-
-Array = NDArray[np.float64]
 
 POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""

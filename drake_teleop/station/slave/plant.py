@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RotationMatrix
@@ -69,21 +68,21 @@ class SlavePlant:
     sensor_frame: Frame
     tool: BodyIndex
     arm: ArmModel
-    start: NDArray[np.float64]
-    X_WS_start: NDArray[np.float64]
-    tip: NDArray[np.float64]
+    start: Array
+    X_WS_start: Array
+    tip: Array
     contact: ToolContactModel
     assumptions: tuple[str, ...]
     config: Slave
     environment: Environment | None
 
     @property
-    def contact_pairs(self) -> NDArray[np.float64]:
+    def contact_pairs(self) -> Array:
         """Pairs of shapes (k, 28) of the compiled contact law, `ShapePairs.compiled_pairs`."""
         return self.contact.compiled_pairs
 
     @cached_property
-    def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
+    def physics_of_plant(self) -> tuple[Array, ...]:
         """Argument `physics` of `plant_rates`.
 
         It contains the arm's table with dry friction, and the load in this table, which a grasp
@@ -97,7 +96,7 @@ class SlavePlant:
         return carried.table, carried.phi_load_view, *laws, no_wrenches
 
     @property
-    def joint_friction(self) -> NDArray[np.float64]:
+    def joint_friction(self) -> Array:
         return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
 
     @property
@@ -115,14 +114,14 @@ class SlavePlant:
         return None if self.contact.drake_contact_reason else self.sheet_instance
 
     @property
-    def start_tip(self) -> NDArray[np.float64]:
+    def start_tip(self) -> Array:
         """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
         R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
         return start[4:] + R_WS.matrix() @ self.tip
 
 
-def start_pose(slave: Slave) -> NDArray[np.float64]:
+def start_pose(slave: Slave) -> Array:
     """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
@@ -156,7 +155,7 @@ def AddSlavePlant(
     builder: DiagramBuilder,
     slave: Slave,
     environment: Environment | None,
-    q_start: NDArray[np.float64] | None = None,
+    q_start: Array | None = None,
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the start of `slave`.
 
@@ -301,7 +300,7 @@ def _remove_arm_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hull_corners_beyond_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
+def _hull_corners_beyond_sensor_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
@@ -322,16 +321,14 @@ def _hull_corners_beyond_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _farthest_point_along_z(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _farthest_point_along_z(hulls: list[Array]) -> Array:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
 
-def _tip_of_tool(
-    plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
-) -> NDArray[np.float64]:
+def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
     instance = plant.get_body(parsed.tool).model_instance()

@@ -9,13 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
@@ -164,7 +164,7 @@ class PositionServo(LeafSystem):
         arm: ArmModel,
         interface: PositionInterface,
         period: float,
-        q_start: NDArray[np.float64],
+        q_start: Array,
     ) -> None:
         super().__init__()
         n = arm.num_joints

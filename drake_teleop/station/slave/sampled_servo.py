@@ -9,11 +9,11 @@ The plant receives the torque a + b (t - h/2), with the area and first moment of
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
@@ -23,8 +23,6 @@ from drake_teleop.station.slave.joint_control import (
 )
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
-
-Array = NDArray[np.float64]
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
 _MIN_EVENT_HZ = 2000.0

@@ -7,7 +7,6 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
@@ -25,6 +24,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
     BODY_STATE_SIZE,
@@ -64,19 +64,19 @@ class ToolContactModel(NamedTuple):
         moving_bodies: indices of other moving bodies, by name.
     """
 
-    compiled_pairs: NDArray[np.float64]
-    monitored_pairs: NDArray[np.float64]
-    joint_table: NDArray[np.float64]
+    compiled_pairs: Array
+    monitored_pairs: Array
+    joint_table: Array
     plant_state_size: int
     drake_contact_reason: str
     tool_bodies: frozenset[int]
     tool_shapes: frozenset[int]
-    leaf_parameters: NDArray[np.float64]
+    leaf_parameters: Array
     leaf_instance: ModelInstanceIndex | None
     moving_bodies: dict[str, BodyIndex]
 
     @property
-    def compiled_law_arguments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compiled_law_arguments(self) -> tuple[Array, Array]:
         return self.compiled_pairs, self.joint_table
 
 
@@ -212,7 +212,7 @@ def supports_pose_conversion(joint: Joint) -> bool:
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
-def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
+def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> Array:
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
@@ -72,7 +72,7 @@ def _mass_text(inertial: Element) -> str:
     return "" if mass is None else (mass.get("value") or mass.text or "").strip()
 
 
-def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
+def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
@@ -83,9 +83,7 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64
     return tensor
 
 
-def correct_impossible_inertia(
-    inertia: NDArray[np.float64], name: str, report: RepairReport
-) -> NDArray[np.float64]:
+def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
     if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _ROUNDING_KG_M2:
@@ -101,7 +99,7 @@ def _write_inertial(
     link: Element,
     pose: Element | None,
     mass: float,
-    inertia: NDArray[np.float64],
+    inertia: Array,
     *,
     is_sdf: bool,
 ) -> None:
@@ -120,8 +118,8 @@ def _write_inertial(
 
 
 def nearest_possible_inertia(
-    inertia: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+    inertia: Array,
+) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal

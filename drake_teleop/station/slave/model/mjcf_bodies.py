@@ -7,10 +7,10 @@ from itertools import count
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
     MAX_SI_VALUE,
@@ -42,7 +42,6 @@ _NUM_SIZES_OF_SHAPE = {
 }  # numbers in size
 _ROUND_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
-_Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)
@@ -51,8 +50,8 @@ class Joint:
 
     name: str
     kind: str
-    anchor: _Array
-    axis: _Array
+    anchor: Array
+    axis: Array
     attributes: Attributes
     limits: tuple[float, float] | None
     ref: float

@@ -8,11 +8,11 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
@@ -51,7 +51,7 @@ class Attributes(dict[str, str]):
             return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
-    def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
+    def vector(self, name: str, default: tuple[float, ...]) -> Array:
         """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
         if (
@@ -209,12 +209,12 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     return merged
 
 
-def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMatrix:
+def _rotation_about_axis(axis: Array, angle: float) -> RotationMatrix:
     length = float(np.linalg.norm(axis))
     return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
 
 
-def smallest_rotation_of_z_to(z: NDArray[np.float64]) -> RotationMatrix:
+def smallest_rotation_of_z_to(z: Array) -> RotationMatrix:
     """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
