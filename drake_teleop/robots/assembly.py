@@ -173,7 +173,7 @@ class PartStreams:
 
 
 class SensorPoseOfJoints(Protocol):
-    """Interface of an arm's kinematics, such as `station.slave.plant.ArmKinematics`."""
+    """Interface of an arm's kinematics, such as `station.slave.arm.ArmModel`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

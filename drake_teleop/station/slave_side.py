@@ -351,8 +351,8 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         if slave.contact.plant_state_size:
             builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
     export_outputs(builder, contact, "true_contact_wrench_W")
-    if slave.sheet_instance is not None:
-        sheet = plant.get_state_output_port(slave.sheet_instance)
+    if slave.contact.leaf_instance is not None:
+        sheet = plant.get_state_output_port(slave.contact.leaf_instance)
         builder.ExportOutput(sheet, "sheet_state")
         if slave.compiled_sheet_instance is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))

@@ -90,7 +90,7 @@ def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
 
 def test_materials_of_both_sides_combine_to_those_of_the_slot():
     slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
-    pairs = slave_at(slot).contact_pairs
+    pairs = slave_at(slot).contact.compiled_pairs
     assert len(pairs) == 2 * 7
     np.testing.assert_allclose(
         pairs[:, 22:26], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12
@@ -99,7 +99,7 @@ def test_materials_of_both_sides_combine_to_those_of_the_slot():
 
 def test_contact_does_not_pull_a_fast_ball():
     """Hunt and Crossley: k x (1 + d times the speed inwards), never negative."""
-    pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
+    pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact.compiled_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
     for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
         contact_force(pair, 1e-3, up, outwards * up, force)
@@ -185,7 +185,8 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     assert status == IkStatus.OK
     environment_wrench(
         arm.table,
-        *slave.contact.compiled_law_arguments,
+        slave.contact.compiled_pairs,
+        slave.contact.joint_table,
         np.zeros(6),
         q,
         0 * q,

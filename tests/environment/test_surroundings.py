@@ -81,7 +81,8 @@ def test_walls_and_boxes_follow_drakes_contact_law():
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -137,7 +138,12 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         arm = [get(context, slave.instance) for get in (plant.GetPositions, plant.GetVelocities)]
         state = plant.GetPositionsAndVelocities(context)
         environment_wrench(
-            *(slave.arm.table, *slave.contact.compiled_law_arguments, np.zeros(6)),
+            *(
+                slave.arm.table,
+                slave.contact.compiled_pairs,
+                slave.contact.joint_table,
+                np.zeros(6),
+            ),
             *arm,
             np.zeros(2),
             state,
@@ -270,7 +276,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
     wall = Wall(position=[0.5, 0.0, 0.0])
     built, found = AddSlavePlant(DiagramBuilder(), slave, wall), []
-    pairs, joints = built.contact.compiled_law_arguments
+    pairs, joints = built.contact.compiled_pairs, built.contact.joint_table
     for height in (0.2499, 0.2501, 0.3279, 0.3281):
         rows = [pairs.copy(), built.contact.monitored_pairs.copy()]
         for row in rows:

@@ -156,7 +156,9 @@ def test_tool_from_mass_and_shapes():
     touching = AddSlavePlant(
         DiagramBuilder(), Slave(tool=Tool(mass=2.0, shapes=shapes[:1])), SheetSpring()
     )
-    np.testing.assert_allclose(touching.contact_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15)
+    np.testing.assert_allclose(
+        touching.contact.compiled_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15
+    )
 
 
 def test_only_load_makes_contact(folder, tmp_path):

@@ -51,12 +51,13 @@ def test_wrench_equals_drakes(leaf, most):
         sheet = np.array([0.01 * random.uniform(-1, 1), 0.1 * random.normal()])
         plant.SetPositions(context, slave.instance, q)
         plant.SetVelocities(context, slave.instance, v)
-        plant.SetPositions(context, slave.sheet_instance, sheet[:1])
-        plant.SetVelocities(context, slave.sheet_instance, sheet[1:])
+        plant.SetPositions(context, slave.contact.leaf_instance, sheet[:1])
+        plant.SetVelocities(context, slave.contact.leaf_instance, sheet[1:])
         expected = drake_wrench(plant, context, slave.tool)
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -88,7 +89,8 @@ def test_peg_in_slot_equals_drakes_with_many_pairs():
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -108,7 +110,8 @@ def test_applied_wrench_is_shifted_to_world_origin():
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
     environment_wrench(
         slave.arm.table,
-        *slave.contact.compiled_law_arguments,
+        slave.contact.compiled_pairs,
+        slave.contact.joint_table,
         push,
         q,
         0 * q,

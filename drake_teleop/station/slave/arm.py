@@ -15,6 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.common.vectors import (
     add_cross_product,
     add_into,
@@ -101,6 +102,12 @@ class ArmModel:
     def phi_load_view(self) -> Array:
         """Inertial parameters phi (10,) of the load about So, in S; changes also change `table`."""
         return self.table[-1, PHI_COLUMN:ROTOR_COLUMN]
+
+    def pose(self, q: Array) -> Array:
+        """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self.table, q, R_WS, p_WS)
+        return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
 
     def with_load(self, phi: Array) -> ArmModel:
         table = self.table.copy()

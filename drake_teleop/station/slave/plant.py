@@ -20,9 +20,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_kinematics, pose_into
+from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, pose_into
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
@@ -76,11 +75,6 @@ class SlavePlant:
     config: Slave
     environment: Environment | None
 
-    @property
-    def contact_pairs(self) -> Array:
-        """Pairs of shapes (k, 28) of the compiled contact law, `ShapePairs.compiled_pairs`."""
-        return self.contact.compiled_pairs
-
     @cached_property
     def physics_of_plant(self) -> tuple[Array, ...]:
         """Argument `physics` of `plant_rates`.
@@ -100,18 +94,13 @@ class SlavePlant:
         return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
 
     @property
-    def sheet_instance(self) -> ModelInstanceIndex | None:
-        """Model instance of the sheet spring's leaf or another `moving_part`, or None."""
-        return self.contact.leaf_instance
-
-    @property
     def can_touch(self) -> bool:
-        return len(self.contact_pairs) > 0 or bool(self.contact.drake_contact_reason)
+        return len(self.contact.compiled_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
     def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
-        """`sheet_instance` if the compiled contact law computes its contact, else None."""
-        return None if self.contact.drake_contact_reason else self.sheet_instance
+        """`contact.leaf_instance` if the compiled law computes its contact, else None."""
+        return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
     @property
     def start_tip(self) -> Array:
@@ -347,29 +336,14 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 
-@dataclass(frozen=True, eq=False)
-class ArmKinematics:
-    """Kinematics of an arm: joint names from the base outwards, and `ArmModel.table`."""
-
-    joint_names: tuple[str, ...]
-    table: Array
-
-    def pose(self, q: Array) -> Array:
-        """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
-        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-        forward_kinematics(self.table, q, R_WS, p_WS)
-        return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
-
-
 def read_arm_kinematics(
     model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
-) -> ArmKinematics:
-    """Return the kinematics of the arm in a model file, or raise DrakeTeleopError."""
+) -> ArmModel:
+    """Return the arm in a model file, without default limits, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
         finalize_plant(plant)
-        found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
-    arm = ArmKinematics(found.joint_names, found.table)
-    arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
+        arm = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    arm.pose(np.zeros(arm.num_joints))  # Load the compiled function before the first reading.
     return arm

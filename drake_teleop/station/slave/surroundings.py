@@ -75,10 +75,6 @@ class ToolContactModel(NamedTuple):
     leaf_instance: ModelInstanceIndex | None
     moving_bodies: dict[str, BodyIndex]
 
-    @property
-    def compiled_law_arguments(self) -> tuple[Array, Array]:
-        return self.compiled_pairs, self.joint_table
-
 
 def make_empty_contact_model() -> ToolContactModel:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
