@@ -65,12 +65,11 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _all_solutions_into(
-    R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array
-) -> int:
+def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
     """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
-    Out of reach they are nan, or with `clamp` those of the nearest reachable wrist centre.
+    Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
+    q5 <= 0. Out of reach they are those of the nearest reachable wrist centre.
     """
     status = _OK
     x = p[0] - FLANGE_OFFSET_M * R[0, 2]
@@ -80,9 +79,6 @@ def _all_solutions_into(
     inner_reach = abs(UPPER_ARM_LENGTH_M - FOREARM_LENGTH_M)
     distance = np.sqrt(x * x + y * y + z * z)
     if distance > reach or distance < inner_reach:
-        if not clamp:
-            q[:] = np.nan
-            return _OUT_OF_REACH
         scale = (reach if distance > reach else inner_reach) / distance
         x, y, z = scale * x, scale * y, scale * z
         distance *= scale
@@ -157,7 +153,7 @@ def _nearest_branch_into(
     if not (np.isfinite(R.sum()) and all_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _all_solutions_into(R, p, reference[0], reference[3], True, branches)
+    status = _all_solutions_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):
@@ -191,17 +187,6 @@ def solve_pose_command(
     R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
     R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
     return _nearest_branch_into(R, pose[4:7], reference, lower, upper, max_step, q)
-
-
-def all_ik_solutions(R_WS: Array, p_WS: Array) -> Array:
-    """Return the eight solutions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
-
-    Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
-    q5 <= 0. Joint limits are ignored; an undetermined joint is 0.
-    """
-    q = np.empty((8, 6))
-    _all_solutions_into(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
-    return q - 2.0 * np.pi * np.ceil(q / (2.0 * np.pi) - 0.5)
 
 
 def nearest_branch(
