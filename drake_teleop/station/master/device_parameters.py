@@ -1,7 +1,8 @@
-"""Parameters of a haptic device in one vector for compiled code, with named indices."""
+"""Parameters of a haptic device in one vector for compiled code, and its end stops."""
 
 from __future__ import annotations
 
+from drake_teleop.common.compiled import njit
 from drake_teleop.station.passivity.memory import SlotAllocator
 
 NUM_DEVICE_PARAMETERS = 31  #: length of the vector
@@ -21,3 +22,13 @@ INERTIA_SLOT = _layout.number()  #: apparent inertia at the grip about every axi
 WORKSPACE_CENTRE_SLOTS = _layout.vector(3)  #: centre of the workspace, p_B [m]
 HALF_WORKSPACE_SLOTS = _layout.vector(3)  #: half edges of the workspace [m]
 MAX_ROTATION_SLOTS = _layout.vector(3)  #: largest yaw, pitch and roll [rad]
+
+
+@njit(cache=True)
+def end_stop_force(x, rate, lower, upper, stiffness, damping):
+    """Return the force of a spring and damper that never pull, on a coordinate outside limits."""
+    if x > upper:
+        return min(0.0, -stiffness * (x - upper) - damping * rate)
+    if x < lower:
+        return max(0.0, -stiffness * (x - lower) - damping * rate)
+    return 0.0

@@ -17,7 +17,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
-from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
+from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
 from drake_teleop.station.slave.arm import (
@@ -67,12 +67,8 @@ def leader_acceleration(arm, joint_table, q, v, applied, motor, vdot):
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(v[i] / FRICTION_TANH_SPEED)
         tau[i] -= joint_table[_VISCOUS_ROW, i] * v[i]
-        over, under = q[i] - joint_table[_UPPER_ROW, i], q[i] - joint_table[_LOWER_ROW, i]
-        damping = joint_table[_STOP_DAMPING_ROW, i] * v[i]
-        if over > 0.0:
-            tau[i] += min(0.0, -joint_table[_STOP_STIFFNESS_ROW, i] * over - damping)
-        elif under < 0.0:
-            tau[i] += max(0.0, -joint_table[_STOP_STIFFNESS_ROW, i] * under - damping)
+        lower, upper, stiffness, damping = joint_table[_LOWER_ROW : _STOP_DAMPING_ROW + 1, i]
+        tau[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
     forward_dynamics(arm, q, v, tau, wrench, vdot)
 
 

@@ -35,6 +35,7 @@ from drake_teleop.station.master.device_parameters import (
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
     VISCOUS_SLOTS,
+    end_stop_force,
 )
 
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
@@ -198,24 +199,15 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
 
 
 @njit(cache=True)
-def _end_stop_torque(angle, rate, lower, upper, stiffness, damping):
-    if angle > upper:
-        return min(0.0, -stiffness * (angle - upper) - damping * rate)
-    if angle < lower:
-        return max(0.0, -stiffness * (angle - lower) - damping * rate)
-    return 0.0
-
-
-@njit(cache=True)
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED_RAD_S) + viscous[i] * v[i]
         stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
         damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
-        torque[i] += _end_stop_torque(
+        torque[i] += end_stop_force(
             q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
         )
-    five_bar = _end_stop_torque(
+    five_bar = end_stop_force(
         q[1] - q[2],
         v[1] - v[2],
         FIVE_BAR_RANGE_RAD[0],

@@ -26,6 +26,7 @@ from drake_teleop.station.master.device_parameters import (
     MAX_ROTATION_SLOTS,
     VISCOUS_SLOTS,
     WORKSPACE_CENTRE_SLOTS,
+    end_stop_force,
 )
 
 # Coulomb friction is proportional to tanh(speed / FRICTION_SPEED_M_S): a slower device creeps.
@@ -65,20 +66,6 @@ def _drag_coefficient(motion, coulomb, viscous, speed_of_tanh):
 
 
 @njit(cache=True)
-def _end_stop_force(beyond, rate, stiffness, damping):
-    if beyond > 0.0:
-        return min(0.0, -stiffness * beyond - damping * rate)
-    if beyond < 0.0:
-        return max(0.0, -stiffness * beyond - damping * rate)
-    return 0.0
-
-
-@njit(cache=True)
-def _penetration_into_end_stop(x, half):
-    return x - half if x > half else (x + half if x < -half else 0.0)
-
-
-@njit(cache=True)
 def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
@@ -87,10 +74,8 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         v[:3], device[COULOMB_SLOTS.start], device[VISCOUS_SLOTS.start], FRICTION_SPEED_M_S
     )
     for i in range(3):
-        beyond = _penetration_into_end_stop(
-            q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
-        )
-        stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M)
+        x, half = q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
+        stop = end_stop_force(x, v[i], -half, half, _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
@@ -109,9 +94,9 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
     for i in range(3):
-        beyond = _penetration_into_end_stop(q[3 + i], device[MAX_ROTATION_SLOTS][i])
-        torque[i] = motor[3 + i] + _end_stop_force(
-            beyond, v[3 + i], _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
+        half = device[MAX_ROTATION_SLOTS][i]
+        torque[i] = motor[3 + i] + end_stop_force(
+            q[3 + i], v[3 + i], -half, half, _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
         )
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
