@@ -72,9 +72,8 @@ class _PassivityEndBlock(SteppedBlock):
             port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
             for port in self._ports
         ]
-        self._step_method(
-            inputs, np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5), *results
-        )
+        received, is_fresh = np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
+        self._step_method(inputs, received, is_fresh, *results)
 
     def _calc_packet(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._step_results(context)[-1])
