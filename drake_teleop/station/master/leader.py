@@ -279,15 +279,10 @@ class LeaderArm(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        constants = (*device.compiled_constants, _operator_hand_weight(device))
+        gravity = np.linalg.norm(device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN:][:3])
+        hand_weight = float(device.parameters[HAND_MASS_SLOT] * gravity)
+        constants = (*device.compiled_constants, hand_weight)
         super().__init__(period, device, q_initial, step_leader, constants)
-
-
-def _operator_hand_weight(device: LeaderDevice) -> float:
-    gravity = np.linalg.norm(
-        device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3]
-    )
-    return float(device.parameters[HAND_MASS_SLOT] * gravity)
 
 
 class LeaderDisplay(ForceDisplay):

@@ -105,16 +105,12 @@ def ArmModelFromPlant(
         table=table,
         lower=lower,
         upper=upper,
-        velocity_limit=_array_per_joint([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=_array_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=_array_per_joint([_effort_limit(plant, j) for j in joints]),
+        velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
+        acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
+        effort_limit=np.array([_effort_limit(plant, j) for j in joints]),
         position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
         velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
     )
-
-
-def _array_per_joint(values: list[float]) -> Array:
-    return np.array(values, dtype=np.float64)
 
 
 def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:

@@ -60,7 +60,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_ROW_COLUMN] >= 0.0 else pair
+        box = _place_box_at_body(pair, bodies, placed)
         depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -85,7 +85,9 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
-    """Write a pair, with its box at the present pose of the body, to `placed` (28,); return it."""
+    """Return a pair with its box at the present pose of the body, as `placed` (28,) if it moves."""
+    if pair[BODY_ROW_COLUMN] < 0.0:
+        return pair
     body = bodies[int(pair[BODY_ROW_COLUMN])]
     copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
@@ -106,14 +108,11 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
-        if pair[BODY_ROW_COLUMN] >= 0.0:
-            _place_box_at_body(pair, bodies, placed)
-        else:
-            copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
-        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
+        box = _place_box_at_body(pair, bodies, placed)
+        if min_distance_of_boxes(pair, box, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_ROW_COLUMN] >= 0.0 else pair
+        box = _place_box_at_body(pair, bodies, placed)
         if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
             return PROXIMITY_TOUCHING
     return PROXIMITY_FAR

@@ -191,15 +191,10 @@ def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, 
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _name_as_identifier(
-            body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
-        ): (body.index())
+        re.sub(r"\W+", "_", body.name() if names.count(body.name()) == 1 else full): body.index()
         for body in moving
+        for full in [body.scoped_name().get_full()]
     }
-
-
-def _name_as_identifier(name: str) -> str:
-    return re.sub(r"\W+", "_", name)
 
 
 def supports_pose_conversion(joint: Joint) -> bool:

@@ -33,7 +33,8 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     values. Return True if a link that joints may move has no inertia.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
-    if inertial is None or inertial.find("mass") is None:
+    mass_element = link.find("inertial/mass")
+    if inertial is None or mass_element is None:
         if is_sdf:
             report.state_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
@@ -42,7 +43,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     if name == WORLD_NAME:
         link.remove(inertial)
         return False
-    text = _mass_text(inertial)
+    text = (mass_element.get("value") or mass_element.text or "").strip()
     mass, inertia = parse_number(text), _inertia_tensor_of(inertial, is_sdf=is_sdf)
     fault = ""
     if not 0.0 <= mass <= MAX_SI_VALUE:
@@ -65,11 +66,6 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
             link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
         )
     return not at_rest and not inertia.any()
-
-
-def _mass_text(inertial: Element) -> str:
-    mass = inertial.find("mass")
-    return "" if mass is None else (mass.get("value") or mass.text or "").strip()
 
 
 def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
+from drake_teleop.common.errors import silent_stderr
 from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
@@ -99,15 +99,8 @@ def _convert_mesh(
     file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
-    if not files.may_read(file):
-        return (
-            f"meshes in {file.resolve().parent} are outside the model's folder and its packages"
-            " (name their folder: --package-path, slave.package_paths)"
-        )
-    try:
-        files.check_file(file)
-    except DrakeTeleopError as error:
-        return str(error)
+    if fault := files.access_fault(file, "meshes"):
+        return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"

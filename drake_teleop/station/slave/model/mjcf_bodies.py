@@ -7,13 +7,11 @@ from itertools import count
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MAX_SI_VALUE,
     MIN_VECTOR_LENGTH,
     Attributes,
     Mjcf,
@@ -28,6 +26,7 @@ from drake_teleop.station.slave.model.mjcf_masses import (
     primitive_properties,
 )
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
 
 # Elements that generate bodies or joints.
 _GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
@@ -55,13 +54,6 @@ class Joint:
     attributes: Attributes
     limits: tuple[float, float] | None
     ref: float
-
-    def pose(self, q: float) -> RigidTransform:
-        """Return the displacement of the body from its pose in the file to position q [rad, m]."""
-        if self.kind == "slide":
-            return RigidTransform((q - self.ref) * self.axis)
-        turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
-        return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
     def transformed_by(self, X: RigidTransform) -> Joint:
         """Return a copy whose anchor and axis are transformed by X."""

@@ -49,9 +49,8 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     world.generator_tags.clear()
     arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
-        measured = {
-            site for each in mjcf.elements_in("sensor") if (site := _site_of_wrench_sensor(each))
-        }
+        sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
+        measured = {each.get("site", "") for each in sensors}
         arm = _insert_sensor_frame_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
@@ -134,11 +133,6 @@ def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
 
 def _names_of_elements(top: Element, tag: str) -> set[str]:
     return {each.get("name", "") for each in top.iter(tag)}
-
-
-def _site_of_wrench_sensor(sensor: Element) -> str:
-    is_wrench = sensor.tag in ("force", "torque")
-    return sensor.get("site", "") if is_wrench else ""
 
 
 def _split_into_one_joint_bodies(body: Body) -> Body:

@@ -13,13 +13,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _MAX_NESTING_DEPTH = 150  # largest depth of nested elements
 MIN_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
-MAX_SI_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
 _COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")

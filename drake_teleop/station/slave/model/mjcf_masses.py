@@ -39,7 +39,8 @@ def combine_properties(parts: list[MassProperties]) -> MassProperties:
     centre = sum((part.mass * part.centre for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
-        inertia += part.inertia + part.mass * _inertia_of_unit_mass_at(part.centre - centre)
+        p = part.centre - centre
+        inertia += part.inertia + part.mass * (p @ p * np.eye(3) - np.outer(p, p))
     return MassProperties(mass, centre, inertia)
 
 
@@ -130,7 +131,3 @@ def _properties_of_simplices(
 def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
     volume = np.linalg.det(corners) / 6
     return np.abs(volume) if mode == "legacy" else volume
-
-
-def _inertia_of_unit_mass_at(p: Array) -> Array:
-    return np.asarray(p @ p * np.eye(3) - np.outer(p, p))

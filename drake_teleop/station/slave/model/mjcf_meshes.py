@@ -8,7 +8,6 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.triangles import (
     Triangles,
@@ -19,10 +18,6 @@ from drake_teleop.station.slave.model.triangles import (
 )
 
 _NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
-_OUTSIDE_FAULT = (
-    "{kind} files in {folder} are outside the model's folder and its packages"
-    " (name their folder: --package-path, slave.package_paths)"
-)
 _UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 
 
@@ -113,14 +108,7 @@ class MeshLibrary:
         file = self._mjcf.find_file(element, name, folder)
         if file is None:
             return None, _NOT_FOUND_FAULT
-        if self._mjcf.files.may_read(file):
-            try:
-                self._mjcf.files.check_file(file)
-            except DrakeTeleopError as error:
-                self.inaccessible.append(str(error))
-                return None, str(error)
-        else:
-            fault = _OUTSIDE_FAULT.format(kind=element.tag, folder=file.resolve().parent)
+        if fault := self._mjcf.files.access_fault(file, f"{element.tag} files"):
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

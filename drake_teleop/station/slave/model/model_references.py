@@ -106,6 +106,19 @@ class ModelFiles:
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
+    def access_fault(self, path: Path, kind: str) -> str:
+        """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
+        if not self.may_read(path):
+            return (
+                f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
+                " (name their folder: --package-path, slave.package_paths)"
+            )
+        try:
+            self.check_file(path)
+        except DrakeTeleopError as error:
+            return str(error)
+        return ""
+
     def check_file(self, path: Path) -> None:
         """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
