@@ -158,12 +158,11 @@ class HapticDevice(HapticDeviceBase):
 
     def mass_matrix(self, q: Array) -> Array:
         """Return the mass matrix (6, 6), including the hand."""
+        J, M, device = self.jacobian(q), np.empty((6, 6)), self.parameters
         if self.is_phantom:
-            return phantom.mass_matrix(
-                q, self.parameters[HAND_MASS_SLOT], self.parameters[HAND_INERTIA_SLOT]
-            )
-        M = np.empty((6, 6))
-        task_space.mass_matrix_into(q, self.jacobian(q), self.parameters, M)
+            phantom.mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
+        else:
+            task_space.mass_matrix_into(q, J, device, M)
         return M
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:

@@ -213,9 +213,13 @@ class ForceDisplay(LeafSystem):
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
+    def _wrench_to_display(self, context: Context) -> Array:
+        wrench: Array = self._command.Eval(context)
+        return wrench
+
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         step_display(
-            self._command.Eval(context),
+            self._wrench_to_display(context),
             self._device.Eval(context),
             self._parameters,
             self._period,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
 from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
@@ -19,7 +19,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
 from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     LAST_ROW_GRAVITY_COLUMN,
@@ -310,16 +310,9 @@ class LeaderDisplay(ForceDisplay):
         self._constants, self._n = device.compiled_constants, device.num_joints
         self._shortened = np.zeros(6)
 
-    def _calc_drive(self, context: Context, output: BasicVector) -> None:
+    def _wrench_to_display(self, context: Context) -> Array:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
             _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
-            wrench = self._shortened
-        step_display(
-            wrench,
-            self._device.Eval(context),
-            self._parameters,
-            self._period,
-            self._jacobian,
-            output.get_mutable_value(),
-        )
+            return self._shortened
+        return wrench

@@ -259,30 +259,6 @@ def pose_into(q, pose):
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
 
 
-def jacobian(q: Array) -> Array:
-    J = np.empty((6, 6))
-    jacobian_into(q, J)
-    return J
-
-
-def mass_matrix(q: Array, hand_mass: float = 0.0, hand_inertia: float = 0.0) -> Array:
-    M = np.empty((6, 6))
-    mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
-    return M
-
-
-def gravity_torque(q: Array) -> Array:
-    torque = np.empty(6)
-    gravity_torque_into(q, torque)
-    return torque
-
-
-def forward_kinematics(q: Array) -> Array:
-    pose = np.empty(7)
-    pose_into(q, pose)
-    return pose
-
-
 def inverse_kinematics(pose: Array) -> Array:
     """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees."""
     x, y, z = pose[4:7]
