@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
@@ -63,19 +61,3 @@ class JointFriction(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
-
-
-def AddJointFriction(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    instance: ModelInstanceIndex,
-    coulomb: Array,
-    index: NDArray[np.intp],
-) -> None:
-    friction = builder.AddNamedSystem(
-        "joint_friction", JointFriction(coulomb, index, plant.num_velocities())
-    )
-    state = plant.get_state_output_port(instance)
-    builder.Connect(state, friction.GetInputPort("slave_state"))
-    force = plant.get_applied_generalized_force_input_port()
-    builder.Connect(friction.GetOutputPort("generalized_force"), force)

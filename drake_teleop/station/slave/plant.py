@@ -30,7 +30,7 @@ from drake_teleop.station.slave.arm_from_plant import (
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, find_start_posture
-from drake_teleop.station.slave.joint_friction import AddJointFriction, expand_friction_per_joint
+from drake_teleop.station.slave.joint_friction import JointFriction, expand_friction_per_joint
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
@@ -175,7 +175,12 @@ def AddSlavePlant(
         check_motor_strength(arm, start)
     friction = expand_friction_per_joint(slave.friction, arm.joint_names)
     if friction.any():
-        AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
+        law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
+        block = builder.AddNamedSystem("joint_friction", law)
+        state = plant.get_state_output_port(instance)
+        builder.Connect(state, block.GetInputPort("slave_state"))
+        force = plant.get_applied_generalized_force_input_port()
+        builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = np.empty(7) if slave.home else start_pose(slave)
     if slave.home:
