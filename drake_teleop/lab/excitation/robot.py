@@ -128,7 +128,7 @@ def RobotFromModel(
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
-        folders.append(model.folder)
+        folders.append(model.mesh_folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
