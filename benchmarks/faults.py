@@ -41,7 +41,7 @@ from drake_teleop.station import master_side as master
 from drake_teleop.station import slave_side as slave
 from drake_teleop.station import station as station_module
 from drake_teleop.station.channel.channel import Channel
-from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import MinimumJerk, Sine
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.passivity.safe_state import STOP_TIME_S
@@ -361,7 +361,7 @@ class Count:
         blind = (t > fault.start + TIMEOUT + STOP_TIME_S + LATE) & (t < fault.end - 1e-3)
         left = float(felt[blind].max(initial=0.0)) if fault.blinds else 0.0
         self.not_finite += not np.isfinite(force).all()
-        self.too_large += not largest <= FORCE_LIMIT * (1 + 1e-12)
+        self.too_large += not largest <= PEAK_FORCE_N * (1 + 1e-12)
         self.stepped += not step <= STEP
         self.not_zero += not left <= 1e-9
         self.largest = max(self.largest, largest)

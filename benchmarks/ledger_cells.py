@@ -42,8 +42,8 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
-from drake_teleop.station.master.data_sheets import Master, data_sheet_of
-from drake_teleop.station.master.device_parameters import HAND_MASS
+from drake_teleop.station.master.data_sheets import Master, data_sheet_of_block
+from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
     MinimumJerk,
@@ -116,7 +116,9 @@ def draw(seed: int, index: int) -> Drawn:
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
     peak = (
-        Master(model=device, figures=data_sheet_of({"model": device})).device(0.0, 0.0).peak_force
+        Master(model=device, figures=data_sheet_of_block({"model": device}))
+        .device(0.0, 0.0)
+        .peak_force
     )
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
     grips = [name for name, hand in GRIP_IMPEDANCES.items() if force / hand.stiffness < 0.04]
@@ -262,7 +264,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=data_sheet_of({"model": drawn.device})),
+        master=Master(model=drawn.device, figures=data_sheet_of_block({"model": drawn.device})),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,
@@ -279,7 +281,7 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
-    master.GetSubsystemByName("master_device")._constants[0][HAND_MASS] = 0.0
+    master.GetSubsystemByName("master_device")._constants[0][HAND_MASS_SLOT] = 0.0
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_recorded_signals(simulator, SETTLE)
 

@@ -12,9 +12,9 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.phantom import (
-    FORCE_LIMIT,
-    HOME_POSTURE,
-    WRIST_TORQUE_LIMIT,
+    HOME_POSTURE_RAD,
+    PEAK_FORCE_N,
+    PEAK_WRIST_TORQUES_N_M,
     jacobian_into,
 )
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
@@ -70,7 +70,7 @@ def recorded(**changed):
         "slave_state": np.column_stack([joints(0.2 * smooth(T - LATE - 0.016)), joints(0 * T)]),
         "joint_torque": joints(np.full_like(T, 20.0)),
         "intent": pose(-0.07 * smooth(T)),
-        "master_state": np.tile([*HOME_POSTURE, *np.zeros(6)], (len(T), 1)),
+        "master_state": np.tile([*HOME_POSTURE_RAD, *np.zeros(6)], (len(T), 1)),
         "pose_master": pose(-0.07 * smooth(T - 0.02)),
         "pose_command": pose(-0.07 * smooth(T)),
         "joint_command": joints(0.2 * smooth(T - LATE)),
@@ -92,7 +92,7 @@ PLANTED = [
     ("ik_status", (0, 3.0 * during(1, 2)), "OUT_OF_REACH from 1.000 to 2.000 s"),
     ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
     ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
-    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "its largest force or torque from 1.000"),
+    ("force_to_master", (2, PEAK_FORCE_N * during(1, 2)), "its largest force or torque from 1.000"),
     ("master_state", (1, 2.1 * during(1, 2)), "at the end of its workspace from 1.000 to 2.000 s"),
     ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, no packets arrive"
      " from the slave, from 1.000 to 2.000 s"),
@@ -122,7 +122,7 @@ def test_only_the_planted_condition_is_reported(name, change, said):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("force_to_master", (2, FORCE_LIMIT * during(1.0, 1.15))),
+        ("force_to_master", (2, PEAK_FORCE_N * during(1.0, 1.15))),
         ("ports", (5, 0.15 * during(1.0, 1.15))),
         ("pose_received", (6, 0.04 * during(1.6, 1.75))),
         ("slave_state", (5, 0.01 * during(1.0, 1.15))),
@@ -180,10 +180,10 @@ def test_ledger_reserve_warning_gives_the_required_energy():
 def test_wrist_motor_limit_uses_the_device_axes():
     q, J = np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]), np.empty((6, 6))
     jacobian_into.py_func(q, J)
-    posture = (slice(0, 6), q - HOME_POSTURE)
+    posture = (slice(0, 6), q - HOME_POSTURE_RAD)
     about = J[3:, 5]  # the last axis, that of the weakest motor
     for share, warnings in ((1.0, 1), (0.99, 0)):
-        torque = share * WRIST_TORQUE_LIMIT[2] * during(1, 2)[:, np.newaxis] * about
+        torque = share * PEAK_WRIST_TORQUES_N_M[2] * during(1, 2)[:, np.newaxis] * about
         full = (slice(3, 6), torque)
         found = run_warnings(
             recorded(force_to_master=full, master_state=posture), OVER_NETWORK, ARM

@@ -69,10 +69,10 @@ def test_arm_and_sensor_stay_within_their_limits(movement):
 def test_master_stays_within_workspace_and_force(movement):
     _, result = movement
     q = result["master_state"][:, :6]
-    assert np.all(margin(q, phantom.JOINT_LOWER, phantom.JOINT_UPPER) > np.radians(30))
-    assert np.all(margin(q[:, 1] - q[:, 2], *phantom.FIVE_BAR_RANGE) > np.radians(20))
+    assert np.all(margin(q, phantom.JOINT_LOWER_RAD, phantom.JOINT_UPPER_RAD) > np.radians(30))
+    assert np.all(margin(q[:, 1] - q[:, 2], *phantom.FIVE_BAR_RANGE_RAD) > np.radians(20))
     force = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
-    assert np.all(force < 0.2 * phantom.FORCE_LIMIT)
+    assert np.all(force < 0.2 * phantom.PEAK_FORCE_N)
     assert np.all(np.linalg.norm(result["hand_wrench_E"][:, :3], axis=1) < 30)
 
 
@@ -89,7 +89,7 @@ def test_station_is_at_rest_before_the_intent_starts(name):
 def test_contact_is_one_touch_with_small_deflection(movement):
     scenario, result = movement
     bend = np.abs(result["sheet_state"][:, 0]).max()
-    assert 0.002 < bend < 0.5 * scenario.sheet_spring.largest_small_deflection
+    assert 0.002 < bend < 0.5 * scenario.sheet_spring.max_linear_deflection
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
     assert 0.205 < result.t[touching].min() < 0.235
     assert result.t[touching].max() < 0.3

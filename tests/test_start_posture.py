@@ -26,7 +26,11 @@ from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import holding_torque, pose_into
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
-from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_texts, start_overlaps
+from drake_teleop.station.slave.posture_shapes import (
+    PostureShapes,
+    overlap_warnings,
+    start_overlaps,
+)
 from drake_teleop.station.slave.slave_config import Slave
 
 pytestmark = pytest.mark.slow
@@ -235,7 +239,7 @@ def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
     for row in usable[:: len(usable) // 500 + 1]:
         shapes.move_to(postures.q[row])
-        assert (row in clear) != bool(overlap_texts(shapes, of_arm=True))
+        assert (row in clear) != bool(overlap_warnings(shapes, of_arm=True))
     (only,) = _rows_to_solve(shapes.arm, postures, region, None)
     np.testing.assert_array_equal(only, usable)
 

@@ -7,6 +7,7 @@ import re
 import weakref
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
@@ -31,7 +32,7 @@ from drake_teleop.station.simulation import (
     advance_without_garbage_collection,
     simulate,
 )
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, sensor_motion
+from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, sensor_motion
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -225,7 +226,7 @@ def test_apparent_mass_is_the_device_with_sigma_0(felt):
     hand, acceleration, _ = felt[0.0]
     q = phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
     grip = OperatorConfig(grip="firm").hand
-    M, J = phantom.mass_matrix(q, grip.mass, grip.inertia), phantom.jacobian(q)
+    M, J = arrays.mass_matrix(q, grip.mass, grip.inertia), arrays.jacobian(q)
     # A vertical force meets this mass when the stylus is held upright by the wrist.
     inverse_inertia = J @ np.linalg.inv(M) @ J.T
     mass = np.linalg.inv(inverse_inertia)[2, 2]
@@ -248,7 +249,7 @@ def test_energy_balance_of_the_ideal_loop(slave):
     steps = np.sum(held[:-1] * (twist[1:] + twist[:-1]), axis=1) / 2 / 2000
     q, v = np.split(result["master_state"], 2, axis=1)
     kinetic = [
-        0.5 * w @ phantom.mass_matrix(p, hand.mass, hand.inertia) @ w
+        0.5 * w @ arrays.mass_matrix(p, hand.mass, hand.inertia) @ w
         for p, w in zip(q, v, strict=True)
     ]
     work = np.concatenate([[0], np.cumsum(steps)])
@@ -306,7 +307,7 @@ def test_the_slave_follows_the_scaled_master(slave):
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
     )
-    out = np.zeros(FRAME_STATE_SIZE)
+    out = np.zeros(SENSOR_MOTION_SIZE)
     heights = []
     for state in result["slave_state"]:
         sensor_motion(slave.arm.table, state[:6], state[6:], np.zeros(6), out)

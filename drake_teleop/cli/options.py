@@ -334,6 +334,6 @@ def _arm_from_options(
             where="--sensor-frame",
             remedy="name the frame or link at which the sensor measures",
         )
-    from drake_teleop.station.slave.plant import arm_of_model_file
+    from drake_teleop.station.slave.plant import read_arm_kinematics
 
-    return arm_of_model_file(model, sensor_frame, package_paths)
+    return read_arm_kinematics(model, sensor_frame, package_paths)

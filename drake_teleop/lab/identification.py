@@ -36,7 +36,7 @@ from drake_teleop.station.scenario import (
 )
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import ArmModel, accelerations
+from drake_teleop.station.slave.arm import ArmModel, sensor_accelerations
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
 
@@ -81,7 +81,7 @@ class LoadIdentification:
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
         contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
-        a = accelerations(arm, self.result["joint_position"][usable], s)
+        a = sensor_accelerations(arm, self.result["joint_position"][usable], s)
         P = limit_covariance(phi, self.batch.covariance)
         return fit_noise_floor(contact, s, omega, alpha, a, P)
 

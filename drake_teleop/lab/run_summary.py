@@ -139,7 +139,7 @@ def _describe_unmodelled_contact(scenario: Scenario) -> str:
     if surroundings is None:
         return ""
     builder = DiagramBuilder()
-    return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
+    return AddSlavePlant(builder, scenario.slave, surroundings).contact.drake_contact_reason
 
 
 def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:

@@ -24,7 +24,7 @@ from drake_teleop.common.vectors import (
     quaternion_product,
 )
 from drake_teleop.live.station_swap import add_cross_fade
-from drake_teleop.station.master.device_parameters import PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
 from drake_teleop.station.passivity.packet import limit_group
@@ -211,9 +211,9 @@ class ExternalMaster(LeafSystem):
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
     """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
-    numbers = scenario.master.device(0.0, 0.0).numbers
+    parameters = scenario.master.device(0.0, 0.0).parameters
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+    limits = np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
     builder, inner = DiagramBuilder(), DiagramBuilder()
     scaling = inner.AddNamedSystem(
         "kinematic_scaling",

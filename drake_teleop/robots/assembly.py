@@ -187,7 +187,7 @@ class PartStreams:
 
 
 class ArmKinematics(Protocol):
-    """Interface of an arm's kinematics, such as `station.slave.plant.Arm`."""
+    """Interface of an arm's kinematics, such as `station.slave.arm.ArmModel`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

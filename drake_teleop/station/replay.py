@@ -208,7 +208,7 @@ class ReplayScene:
         touched = AddedEnvironment([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)
-        self._sheet = touched.sheet
+        self._sheet = touched.leaf_instance
         self._master = None
         if "master_state" in recorded:
             self._master = _add_haptic_device(self.plant, scenario)
@@ -324,7 +324,7 @@ def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
     parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
     return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.folder
+        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.mesh_folder
     )
 
 
@@ -346,7 +346,10 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
         stand = part.floor_stand
         if stand is not None and stand.height > 0:
-            size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
+            size, centre = (
+                (stand.size_x, stand.size_y, stand.height),
+                (stand.centre_x, stand.centre_y),
+            )
             draw_box(
                 f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
             )

@@ -129,7 +129,10 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             happened = result["ik_status"][:, 0] == status
             yield f"inverse kinematics: {status.name}", find_spans(t, happened)
     control = scenario.joint_control
-    asked, fastest = control.speed_gain * _joint_tracking_error(result), arm.velocity_limit
+    asked, fastest = (
+        control.position_loop_gain_per_s * _joint_tracking_error(result),
+        arm.velocity_limit,
+    )
     if control.position_interface is not None:
         fastest = np.minimum(fastest, control.position_interface.max_speed)
     for what, values, limit in (
@@ -151,7 +154,7 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
-        bent = scenario.first_sheet_spring.largest_small_deflection
+        bent = scenario.first_sheet_spring.max_linear_deflection
         yield (
             f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
             find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),

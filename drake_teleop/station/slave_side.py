@@ -24,13 +24,13 @@ from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
 from drake_teleop.station.slave.joint_commands import (
     IK_METHODS,
-    JointFollower,
-    JointTrajectory,
-    SlaveMonitor,
+    ExcitationCommand,
+    JointRangeMonitor,
+    LeaderJointFollower,
     ik_method_name,
 )
 from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
-from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.station.slave.joint_friction import FRICTION_TANH_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
@@ -174,7 +174,7 @@ def _add_inverse_kinematics(
 ) -> LeafSystem:
     arm = body.slave.arm
     make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
-    make_ik = JointFollower if led else make_ik
+    make_ik = LeaderJointFollower if led else make_ik
     ik = make_ik(arm, body.slave.start, body.command_period_s)
     builder.AddNamedSystem("inverse_kinematics", ik)
     if not led:
@@ -195,7 +195,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
     body = _add_slave_blocks(builder, scenario, q_start=start)
-    command = JointTrajectory(trajectory, scenario.simulation.settle)
+    command = ExcitationCommand(trajectory, scenario.simulation.settle)
     builder.AddNamedSystem("joint_trajectory", command)
     connect_ports(builder, command, "joint_command", body.joint_control, "joint_command")
     export_outputs(builder, command, "joint_command")
@@ -244,7 +244,7 @@ def _add_slave_blocks(
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, SLAVE_MONITOR_PERIOD_S))
+    monitor = builder.AddNamedSystem("monitor", JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
     motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
@@ -259,8 +259,8 @@ def _add_slave_blocks(
     if ramps:
         rate = control.GetOutputPort("torque_rate")
         builder.Connect(rate, wrist.GetInputPort("torque_rate"))
-        if slave.sheet_in_compiled_law is not None:
-            sheet = plant.get_state_output_port(slave.sheet_in_compiled_law)
+        if slave.compiled_sheet_instance is not None:
+            sheet = plant.get_state_output_port(slave.compiled_sheet_instance)
             builder.Connect(sheet, control.GetInputPort("sheet_state"))
     for name, port in sample.items():
         builder.ExportOutput(port, name)
@@ -291,7 +291,7 @@ def _add_slave_blocks(
 
 def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
     contact, interface = slave.contact, scenario.joint_control.position_interface
-    if contact.beyond or contact.plant_size or interface is not None:
+    if contact.drake_contact_reason or contact.plant_state_size or interface is not None:
         return 1
     return samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
@@ -300,7 +300,7 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.joint_friction / FRICTION_SPEED)
+    slope = np.diag(slave.joint_friction / FRICTION_TANH_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
         shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
@@ -314,24 +314,24 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:
     plant = slave.plant
-    if slave.contact.beyond:
+    if slave.contact.drake_contact_reason:
         contact = builder.AddNamedSystem(
-            "tool_contact", DrakeContact(slave.contact.bodies, slave.contact.shapes)
+            "tool_contact", DrakeContact(slave.contact.tool_bodies, slave.contact.tool_shapes)
         )
         results = plant.get_contact_results_output_port()
         builder.Connect(results, contact.GetInputPort("contact_results"))
     else:
         contact = builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact))
         builder.Connect(state, contact.GetInputPort("slave_state"))
-        if slave.contact.plant_size:
+        if slave.contact.plant_state_size:
             builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
     export_outputs(builder, contact, "true_contact_wrench_W")
-    if slave.sheet_instance is not None:
-        sheet = plant.get_state_output_port(slave.sheet_instance)
+    if slave.contact.leaf_instance is not None:
+        sheet = plant.get_state_output_port(slave.contact.leaf_instance)
         builder.ExportOutput(sheet, "sheet_state")
-        if slave.sheet_in_compiled_law is not None:
+        if slave.compiled_sheet_instance is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
-    for name, body in slave.contact.moving.items():
+    for name, body in slave.contact.moving_bodies.items():
         pose = builder.AddNamedSystem(MOVING_BODY_POSE_PREFIX + name, MovingBodyPose(plant, body))
         builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})

@@ -3,6 +3,7 @@
 from dataclasses import replace as changed
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -20,7 +21,6 @@ from drake_teleop.lab.analysis.two_port import hybrid_matrix
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
-from drake_teleop.station.master import phantom
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -296,7 +296,7 @@ def test_multipliers_predict_a_slow_decay():
     master = GetBlock(diagram, "master_device")
     context = master.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     state = context.get_mutable_discrete_state(0).get_mutable_value()
-    state[6:] = np.linalg.solve(phantom.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])
+    state[6:] = np.linalg.solve(arrays.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])
     simulator.AdvanceTo(0.7)
     height = read_recorded_signals(simulator, 0.0)["pose_master"][200:, 6]
     assert_same_rate(fitted_rate(height, predicted), predicted)

@@ -1,6 +1,7 @@
 """One-axis parameters of a scenario against its models."""
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -11,7 +12,6 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.solids import Block, Wall
-from drake_teleop.station.master import phantom
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 
@@ -19,7 +19,7 @@ def test_device_mass_if_only_the_inner_link_moves():
     """Vertical force at q = 0: M22 over the link's length squared, with wrist and motor."""
     scenario = replace(Scenario(), master__position=[0.215, 0.0, -0.17])
     axis = OneAxisFromScenario(scenario, (0, 0, 2.0))
-    assert axis.device_mass == pytest.approx(phantom.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
+    assert axis.device_mass == pytest.approx(arrays.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
     assert axis.device_damping == pytest.approx(scenario.master.friction.viscous[1] / 0.215**2)
 
 

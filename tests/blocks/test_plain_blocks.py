@@ -259,11 +259,11 @@ def test_force_display_equals_the_display_of_the_station():
     rows[20]["wrench_command"] = np.full(6, np.nan)
     # The outputs are of the period that follows the update at its start.
     found = stepped(blocks.ForceDisplay(device, T, q), rows, "joint_torque")
-    memory, J, expected = initial_display_state(q, device.numbers), np.zeros((6, 6)), []
+    memory, J, expected = initial_display_state(q, device.parameters), np.zeros((6, 6)), []
     for row in rows:
         for _ in range(2):
             drive, memory[:6] = np.zeros(len(memory)), row["joint_position"]
-            step_display(row["wrench_command"], memory, device.numbers, T, J, drive)
+            step_display(row["wrench_command"], memory, device.parameters, T, J, drive)
             if _ == 0:
                 memory = drive.copy()
         expected.append(drive[:6])

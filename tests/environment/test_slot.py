@@ -15,14 +15,14 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.station.environment.point_contact import (
-    ContactPairs,
+    FindContactPairs,
     contact_force,
     depth_of_sphere_in_box,
 )
 from drake_teleop.station.environment.slot import (
-    PEG_RADIUS,
-    TIP_BALL_CENTRE_Z,
-    UPPER_BALL_CENTRE_Z,
+    PEG_RADIUS_M,
+    TIP_BALL_CENTRE_Z_S_M,
+    UPPER_BALL_CENTRE_Z_S_M,
     Slot,
     _boxes_of_slot,
 )
@@ -46,16 +46,16 @@ def slave_at(slot: Slot):
 def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     """The contact pairs of a body that is one ball about its origin, without any arm."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, PEG_RADIUS))
+    tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, PEG_RADIUS_M))
     friction = CoulombFriction(1.0, 1.0)
-    ball = Sphere(PEG_RADIUS)
+    ball = Sphere(PEG_RADIUS_M)
     plant.RegisterCollisionGeometry(tool, RigidTransform(), ball, "ball", friction)
     environment = AddEnvironment(plant, slot).instances
     plant.Finalize()
     slot.PrepareContact(plant, scene_graph, tool.index())
     shapes = dict.fromkeys(plant.GetCollisionGeometriesForBody(tool), RigidTransform())
     inspector = scene_graph.model_inspector()
-    pairs = ContactPairs(plant, inspector, shapes, environment, slot.slip).known
+    pairs = FindContactPairs(plant, inspector, shapes, environment, slot.slip).compiled_pairs
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 
@@ -68,10 +68,12 @@ def test_the_peg_is_the_tools_ball_and_another_of_its_size():
     inspector = scene_graph.model_inspector()
     balls = plant.GetCollisionGeometriesForBody(plant.get_body(tool))
     centres = [inspector.GetPoseInFrame(ball).translation() for ball in balls]
-    np.testing.assert_array_equal(centres, [[0, 0, TIP_BALL_CENTRE_Z], [0, 0, UPPER_BALL_CENTRE_Z]])
+    np.testing.assert_array_equal(
+        centres, [[0, 0, TIP_BALL_CENTRE_Z_S_M], [0, 0, UPPER_BALL_CENTRE_Z_S_M]]
+    )
     for ball in balls:
         assert isinstance(inspector.GetShape(ball), Sphere)
-        assert inspector.GetShape(ball).radius() == PEG_RADIUS
+        assert inspector.GetShape(ball).radius() == PEG_RADIUS_M
     assert plant.get_body(tool).default_mass() == mass
 
 
@@ -88,7 +90,7 @@ def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
 
 def test_materials_of_both_sides_combine_to_those_of_the_slot():
     slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
-    pairs = slave_at(slot).contact_pairs
+    pairs = slave_at(slot).contact.compiled_pairs
     assert len(pairs) == 2 * 7
     np.testing.assert_allclose(
         pairs[:, 22:26], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12
@@ -97,7 +99,7 @@ def test_materials_of_both_sides_combine_to_those_of_the_slot():
 
 def test_contact_does_not_pull_a_fast_ball():
     """Hunt and Crossley: k x (1 + d times the speed inwards), never negative."""
-    pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
+    pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact.compiled_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
     for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
         contact_force(pair, 1e-3, up, outwards * up, force)
@@ -139,7 +141,7 @@ def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
     floor = np.interp(abs(across), corners[:, 0], corners[:, 1])
     height = floor + 1e-4 + (z + 1.0) * 0.02
     centre_W = slot.X_WM @ np.array([x, across, height])
-    expected = PEG_RADIUS - distance_to(corners, np.array([abs(across), height]))
+    expected = PEG_RADIUS_M - distance_to(corners, np.array([abs(across), height]))
     normal = np.empty(6)
     deepest = max(
         depth_of_sphere_in_box(pair, centre_W, np.eye(3), 0.0, normal)
@@ -175,7 +177,7 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     """
     tilt = RotationMatrix.MakeXRotation(angle)
     R_WS = tilt @ R_WS_HOME
-    middle_S = [0.0, 0.0, (TIP_BALL_CENTRE_Z + UPPER_BALL_CENTRE_Z) / 2]
+    middle_S = [0.0, 0.0, (TIP_BALL_CENTRE_Z_S_M + UPPER_BALL_CENTRE_Z_S_M) / 2]
     p_WS = np.array([0.55, shift, 0.2 - 0.02]) - R_WS.matrix() @ middle_S
     arm, wrench = slave.arm, np.empty(6)
     near = slave.plant.GetDefaultPositions(slave.instance)
@@ -183,7 +185,8 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     assert status == IkStatus.OK
     environment_wrench(
         arm.table,
-        *slave.contact.compiled_law_arguments,
+        slave.contact.compiled_pairs,
+        slave.contact.joint_table,
         np.zeros(6),
         q,
         0 * q,
@@ -204,7 +207,7 @@ def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
 
 def test_peg_tilted_beyond_its_clearance_jams():
     """The walls act on the balls as a couple against the tilt, without a force."""
-    slave, apart = slave_at(DEEP), TIP_BALL_CENTRE_Z - UPPER_BALL_CENTRE_Z
+    slave, apart = slave_at(DEEP), TIP_BALL_CENTRE_Z_S_M - UPPER_BALL_CENTRE_Z_S_M
     play = np.arcsin(DEEP.clearance / apart)
     assert not wrench_at(slave, 0.99 * play, 0.0).any()
     for angle in (1.5 * play, -1.5 * play):

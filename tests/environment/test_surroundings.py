@@ -20,7 +20,7 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise
 from drake_teleop.station.environment.environment import SeveralObjects
 from drake_teleop.station.environment.moving_bodies import (
-    JointTable,
+    MakeJointTable,
     interpolate_joint_state,
     poses_and_twists_into,
 )
@@ -30,7 +30,7 @@ from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
+from drake_teleop.station.slave.drake_contact import ContactPlantCopy, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
@@ -81,7 +81,8 @@ def test_walls_and_boxes_follow_drakes_contact_law():
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -89,9 +90,9 @@ def test_walls_and_boxes_follow_drakes_contact_law():
             np.zeros(0),
             found,
         )
-        expected = contact_wrench_W(results, slave.contact.bodies, slave.contact.shapes)
+        expected = contact_wrench_W(results, slave.contact.tool_bodies, slave.contact.tool_shapes)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-    assert slave.contact.beyond == ""
+    assert slave.contact.drake_contact_reason == ""
     assert most == 3
 
 
@@ -133,11 +134,16 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         size = plant.num_velocities()
         plant.SetVelocities(context, random.normal(size=size) * 10.0 ** random.uniform(-4, 0))
         results = plant.get_contact_results_output_port().Eval(context)
-        expected = contact_wrench_W(results, slave.contact.bodies, slave.contact.shapes)
+        expected = contact_wrench_W(results, slave.contact.tool_bodies, slave.contact.tool_shapes)
         arm = [get(context, slave.instance) for get in (plant.GetPositions, plant.GetVelocities)]
         state = plant.GetPositionsAndVelocities(context)
         environment_wrench(
-            *(slave.arm.table, *slave.contact.compiled_law_arguments, np.zeros(6)),
+            *(
+                slave.arm.table,
+                slave.contact.compiled_pairs,
+                slave.contact.joint_table,
+                np.zeros(6),
+            ),
             *arm,
             np.zeros(2),
             state,
@@ -145,7 +151,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touched.add((bool(k % 2), bool(expected.any())))
-    assert slave.contact.beyond == ""
+    assert slave.contact.drake_contact_reason == ""
     assert len(touched) == 4  # with the block near and far: touching, and not
 
 
@@ -153,7 +159,7 @@ def test_between_two_states_bodies_move_on_smoothly():
     """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
-    (joints, order), h = JointTable(plant, bodies), 0.002
+    (joints, order), h = MakeJointTable(plant, bodies), 0.002
     assert order == [int(body) for body in bodies]
 
     def state(t: float) -> np.ndarray:
@@ -230,13 +236,13 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
     """A box inside the ball, out of reach, makes Drake compute the same samples."""
-    asked, wrench_W = [], ContactTwin.wrench_W
+    asked, wrench_W = [], ContactPlantCopy.wrench_W
 
     def remember(twin, x, state):
         asked.append((x.copy(), state.copy()))
         return wrench_W(twin, x, state)
 
-    monkeypatch.setattr(ContactTwin, "wrench_W", remember)
+    monkeypatch.setattr(ContactPlantCopy, "wrench_W", remember)
     ball, box = Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.188])
     logs, watched = [], []
     for shapes in ([ball], [ball, box]):
@@ -252,7 +258,7 @@ def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
         station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
         logs.append(simulate(station, scenario.simulation))
         slave = AddSlavePlant(DiagramBuilder(), scenario.slave, scenario.surroundings)
-        watched.append(len(slave.contact.watched))
+        watched.append(len(slave.contact.monitored_pairs))
     assert watched == [0, 2]  # its table, too
     # Every number of a state that Drake is asked in is one: the arm's stands twice in it.
     start = slave.arm.num_joints
@@ -270,9 +276,9 @@ def test_separation_of_tool_and_unmodelled_shapes():
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
     wall = Wall(position=[0.5, 0.0, 0.0])
     built, found = AddSlavePlant(DiagramBuilder(), slave, wall), []
-    pairs, joints = built.contact.compiled_law_arguments
+    pairs, joints = built.contact.compiled_pairs, built.contact.joint_table
     for height in (0.2499, 0.2501, 0.3279, 0.3281):
-        rows = [pairs.copy(), built.contact.watched.copy()]
+        rows = [pairs.copy(), built.contact.monitored_pairs.copy()]
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
@@ -349,8 +355,8 @@ def test_example_of_the_docs_runs():
     (example,) = re.findall(r"^```yaml\n(environment:.*?)^```$", text, re.M | re.S)
     scenario = ScenarioFromData(yaml_load(data=example), "station.md")
     slave = AddSlavePlant(DiagramBuilder(), Slave(), scenario.surroundings)
-    assert set(slave.contact.moving) == {"block", "door"}
-    assert slave.contact.beyond == ""
+    assert set(slave.contact.moving_bodies) == {"block", "door"}
+    assert slave.contact.drake_contact_reason == ""
 
 
 def test_unmodelled_contact_is_not_linearised():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
@@ -20,19 +21,19 @@ NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
     """Return postures inside all joint limits, including the five-bar's."""
     rng = np.random.default_rng(seed)
-    q = rng.uniform(phantom.JOINT_LOWER, phantom.JOINT_UPPER, (40 * count, 6))
-    lower, upper = phantom.FIVE_BAR_RANGE
+    q = rng.uniform(phantom.JOINT_LOWER_RAD, phantom.JOINT_UPPER_RAD, (40 * count, 6))
+    lower, upper = phantom.FIVE_BAR_RANGE_RAD
     allowed = (q[:, 1] - q[:, 2] > lower) & (q[:, 1] - q[:, 2] < upper)
     return q[allowed][:count]
 
 
 def parameters(hand_mass=0.0, hand_inertia=0.0, friction=NO_FRICTION) -> np.ndarray:
-    return Master(friction=friction).device(hand_mass, hand_inertia).numbers
+    return Master(friction=friction).device(hand_mass, hand_inertia).parameters
 
 
 def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
     vdot = np.empty(6)
-    phantom.acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
+    phantom.joint_acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
     return vdot
 
 
@@ -52,14 +53,14 @@ def main_gravity(q) -> np.ndarray:
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
-    weight = phantom.WRIST_MASS * phantom.GRAVITY
+    weight = phantom.WRIST_MASS_KG * phantom.GRAVITY_M_S2
     height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
     return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
     q, v = state[:6], state[6:]
-    M = phantom.mass_matrix(q, hand_mass, hand_inertia)
+    M = arrays.mass_matrix(q, hand_mass, hand_inertia)
     return 0.5 * v @ M @ v + potential_energy(q)
 
 
@@ -109,13 +110,15 @@ def test_main_axes_equal_the_closed_forms_of_the_literature():
 
 def test_stylus_is_level_and_points_to_operator_at_home():
     np.testing.assert_allclose(
-        phantom.forward_kinematics(phantom.HOME_POSTURE), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
+        arrays.forward_kinematics(phantom.HOME_POSTURE_RAD),
+        [1, 0, 0, 0, 0.215, 0, -0.170],
+        atol=1e-15,
     )
 
 
 def test_forward_kinematics_is_the_product_of_its_axes():
     for q in random_postures(100):
-        pose = phantom.forward_kinematics(q)
+        pose = arrays.forward_kinematics(q)
         Rx, Ry, Rz = (
             RotationMatrix.MakeXRotation,
             RotationMatrix.MakeYRotation,
@@ -132,14 +135,14 @@ def test_jacobian_is_the_derivative_of_the_pose():
     step = 1e-6
     for q in random_postures(50):
         numeric = np.empty((6, 6))
-        R = rotation(phantom.forward_kinematics(q))
+        R = rotation(arrays.forward_kinematics(q))
         for k in range(6):
-            ahead = phantom.forward_kinematics(q + step * np.eye(6)[k])
-            behind = phantom.forward_kinematics(q - step * np.eye(6)[k])
+            ahead = arrays.forward_kinematics(q + step * np.eye(6)[k])
+            behind = arrays.forward_kinematics(q - step * np.eye(6)[k])
             numeric[:3, k] = (ahead[4:] - behind[4:]) / (2 * step)
             cross = (rotation(ahead) - rotation(behind)) / (2 * step) @ R.T
             numeric[3:, k] = cross[2, 1], cross[0, 2], cross[1, 0]
-        np.testing.assert_allclose(phantom.jacobian(q), numeric, atol=1e-9)
+        np.testing.assert_allclose(arrays.jacobian(q), numeric, atol=1e-9)
 
 
 def test_inverse_kinematics_returns_the_joint_angles():
@@ -148,7 +151,7 @@ def test_inverse_kinematics_returns_the_joint_angles():
         if reach < 0.01 or abs(q[4]) > 1.56:
             continue  # the other branch of the yaw or of the wrist
         np.testing.assert_allclose(
-            phantom.inverse_kinematics(phantom.forward_kinematics(q)), q, atol=1e-9
+            phantom.inverse_kinematics(arrays.forward_kinematics(q)), q, atol=1e-9
         )
 
 
@@ -167,7 +170,7 @@ def test_start_pose_out_of_reach_is_rejected(position, message):
 
 def test_mass_matrix_is_positive_definite_over_the_workspace():
     for q in random_postures(2000):
-        M = phantom.mass_matrix(q)
+        M = arrays.mass_matrix(q)
         np.testing.assert_array_equal(M, M.T)
         assert np.linalg.eigvalsh(M)[0] > 1e-5
 
@@ -176,8 +179,8 @@ def test_hand_adds_only_its_kinetic_energy():
     rng = np.random.default_rng(1)
     for q in random_postures(20):
         v = rng.normal(size=6)
-        twist = phantom.jacobian(q) @ v
-        added = phantom.mass_matrix(q, 0.3, 2e-4) - phantom.mass_matrix(q)
+        twist = arrays.jacobian(q) @ v
+        added = arrays.mass_matrix(q, 0.3, 2e-4) - arrays.mass_matrix(q)
         expected = 0.3 * twist[:3] @ twist[:3] + 2e-4 * twist[3:] @ twist[3:]
         assert v @ added @ v == pytest.approx(expected, rel=1e-12)
 
@@ -186,14 +189,14 @@ def test_wrist_is_a_point_mass_and_three_rotating_links():
     rng = np.random.default_rng(2)
     for q in random_postures(20):
         v = rng.normal(size=6)
-        J = phantom.jacobian(q)
+        J = arrays.jacobian(q)
         main = np.zeros((6, 6))
         main[:3, :3] = main_mass_matrix(q)
         motors = np.array([13.3, 11.2, 11.2]) ** 2 * 1.08e-6
         expected = v @ main @ v + motors @ v[:3] ** 2 + 0.15 * np.sum((J[:3] @ v) ** 2)
         for last in (4, 5, 6):
             expected += 5e-5 * np.sum((J[3:, :last] @ v[:last]) ** 2)
-        assert v @ phantom.mass_matrix(q) @ v == pytest.approx(expected, rel=1e-12)
+        assert v @ arrays.mass_matrix(q) @ v == pytest.approx(expected, rel=1e-12)
 
 
 def test_gravity_is_the_gradient_of_the_potential_energy():
@@ -203,9 +206,9 @@ def test_gravity_is_the_gradient_of_the_potential_energy():
             (potential_energy(q + step * e) - potential_energy(q - step * e)) / (2 * step)
             for e in np.eye(6)
         ]
-        np.testing.assert_allclose(phantom.gravity_torque(q), gradient, atol=1e-9)
-        wrist = phantom.gravity_torque(q)[:3] - main_gravity(q)
-        np.testing.assert_allclose(wrist, 0.15 * 9.81 * phantom.jacobian(q)[2, :3], atol=1e-15)
+        np.testing.assert_allclose(arrays.gravity_torque(q), gradient, atol=1e-9)
+        wrist = arrays.gravity_torque(q)[:3] - main_gravity(q)
+        np.testing.assert_allclose(wrist, 0.15 * 9.81 * arrays.jacobian(q)[2, :3], atol=1e-15)
 
 
 def test_coriolis_follows_from_the_mass_matrix():
@@ -217,10 +220,7 @@ def test_coriolis_follows_from_the_mass_matrix():
         v = rng.normal(size=6)
         dM = np.array(
             [
-                (
-                    phantom.mass_matrix(q + step * e, *hand)
-                    - phantom.mass_matrix(q - step * e, *hand)
-                )
+                (arrays.mass_matrix(q + step * e, *hand) - arrays.mass_matrix(q - step * e, *hand))
                 / (2 * step)
                 for e in np.eye(6)
             ]
@@ -229,11 +229,11 @@ def test_coriolis_follows_from_the_mass_matrix():
         wrench, torque = rng.normal(size=6), rng.normal(size=6)
         vdot = acceleration(q, v, wrench, torque, parameters(*hand))
         balance = (
-            phantom.mass_matrix(q, *hand) @ vdot
+            arrays.mass_matrix(q, *hand) @ vdot
             + coriolis
-            + phantom.gravity_torque(q)
+            + arrays.gravity_torque(q)
             - torque
-            - phantom.jacobian(q).T @ wrench
+            - arrays.jacobian(q).T @ wrench
         )
         np.testing.assert_allclose(balance, 0, atol=1e-9)
 
@@ -271,7 +271,7 @@ def test_energy_balance_with_held_inputs():
     wrench = np.array([*rng.normal(size=3), 0, 0, 0])
     start = free_state()
     after = advance(start, wrench, torque, parameters(*hand), 5e-4, 200)
-    path = phantom.forward_kinematics(after[:6])[4:] - phantom.forward_kinematics(start[:6])[4:]
+    path = arrays.forward_kinematics(after[:6])[4:] - arrays.forward_kinematics(start[:6])[4:]
     work = wrench[:3] @ path + torque @ (after[:6] - start[:6])
     gained = energy(after, *hand) - energy(start, *hand)
     assert abs(work) > 1e-2
@@ -284,7 +284,7 @@ def test_hand_wrench_equals_its_joint_torque():
     for q in random_postures(20):
         v, wrench = rng.normal(size=6), rng.normal(size=6)
         by_hand = acceleration(q, v, wrench, np.zeros(6), parameters())
-        by_motor = acceleration(q, v, np.zeros(6), phantom.jacobian(q).T @ wrench, parameters())
+        by_motor = acceleration(q, v, np.zeros(6), arrays.jacobian(q).T @ wrench, parameters())
         np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
 
 
@@ -294,8 +294,8 @@ STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5,
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_joint_stops_at_its_limit(joint, side):
-    limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
-    q = phantom.HOME_POSTURE.copy()
+    limit = (phantom.JOINT_UPPER_RAD if side > 0 else phantom.JOINT_LOWER_RAD)[joint]
+    q = phantom.HOME_POSTURE_RAD.copy()
     q[joint] = limit - side * 0.02
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
@@ -303,7 +303,7 @@ def test_joint_stops_at_its_limit(joint, side):
     friction = parameters(friction=JointFriction())
     state, farthest = np.concatenate([q, np.zeros(6)]), 0.0
     for _ in range(2000):
-        torque = push + phantom.gravity_torque(state[:6])
+        torque = push + arrays.gravity_torque(state[:6])
         if joint in (1, 2):
             torque[3 - joint] += 20 * (q[3 - joint] - state[3 - joint]) - 0.5 * state[9 - joint]
         state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
@@ -315,16 +315,18 @@ def test_joint_stops_at_its_limit(joint, side):
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_end_stop_pushes_but_never_pulls(joint, side):
-    q = phantom.HOME_POSTURE.copy()
-    q[joint] = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint] + side * 0.01
+    q = phantom.HOME_POSTURE_RAD.copy()
+    q[joint] = (phantom.JOINT_UPPER_RAD if side > 0 else phantom.JOINT_LOWER_RAD)[
+        joint
+    ] + side * 0.01
     if joint in (1, 2):
         q[3 - joint] = q[joint] - side * 0.1
     back = []
     for rate in (-10.0, -0.01, 0.0, 0.01, 10.0):  # out of the stop and into it
         # No joint alone has a Coriolis force on itself.
         v = side * rate * np.eye(6)[joint]
-        held = acceleration(q, v, np.zeros(6), phantom.gravity_torque(q), parameters())
-        back.append(-side * (phantom.mass_matrix(q) @ held)[joint])
+        held = acceleration(q, v, np.zeros(6), arrays.gravity_torque(q), parameters())
+        back.append(-side * (arrays.mass_matrix(q) @ held)[joint])
     assert back[0] == pytest.approx(0.0, abs=1e-9)
     assert 0.0 < back[1] < back[2] < back[3] < back[4]
     assert back[3] - back[2] == pytest.approx(back[2] - back[1])  # damped alike both ways
@@ -335,7 +337,7 @@ def test_the_five_bar_stops_at_its_limits():
     for side, limit in ((1, np.radians(65)), (-1, np.radians(-55))):
         state = np.zeros(12)
         for _ in range(3000):
-            torque = phantom.gravity_torque(state[:6])
+            torque = arrays.gravity_torque(state[:6])
             torque[1] += 0.5 * side
             torque[2] -= 0.5 * side
             state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
@@ -364,7 +366,7 @@ def simulate(q_initial, duration, motor_torque):
 
 def test_gravity_compensation_holds_the_device_still():
     q = np.array([0.2, 0.3, 0.1, 0.1, -0.2, 0.3])
-    result = simulate(q, 0.2, phantom.gravity_torque(q))
+    result = simulate(q, 0.2, arrays.gravity_torque(q))
     np.testing.assert_allclose(result["state"], [*q, *np.zeros(6)], atol=1e-12)
 
 
@@ -373,13 +375,13 @@ def test_ports_agree_with_the_state():
     result = simulate(q, 0.05, np.zeros(6))
     q, v = result["state"][:6], result["state"][6:]
     assert np.linalg.norm(v) > 0.1
-    np.testing.assert_allclose(result["pose_master"], phantom.forward_kinematics(q), atol=1e-15)
-    np.testing.assert_allclose(result["twist_master"], phantom.jacobian(q) @ v, atol=1e-14)
+    np.testing.assert_allclose(result["pose_master"], arrays.forward_kinematics(q), atol=1e-15)
+    np.testing.assert_allclose(result["twist_master"], arrays.jacobian(q) @ v, atol=1e-14)
 
 
 def test_long_period_or_start_beyond_limit_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"master\.period"):
-        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE)
+        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE_RAD)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
         device.MasterDevice(5e-4, Master().device(0.1, 1e-4), np.array([2.0, 0, 0, 0, 0, 0]))
 
@@ -391,7 +393,7 @@ def test_friction_too_large_for_the_step_is_rejected(name, slope):
     def made(last):
         friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
         model = Master(friction=friction).device(0.1, 1e-4)
-        device.MasterDevice(5e-4, model, phantom.HOME_POSTURE)
+        device.MasterDevice(5e-4, model, phantom.HOME_POSTURE_RAD)
 
     made(0.5)
     with pytest.raises(DrakeTeleopError, match=r"master\.friction"):

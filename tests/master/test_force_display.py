@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.blocks import Fault
@@ -29,7 +30,7 @@ def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
-    start = initial_display_state(np.array(q, dtype=float), DEVICE.numbers)
+    start = initial_display_state(np.array(q, dtype=float), DEVICE.parameters)
     block.GetInputPort("for_display").FixValue(context, start)
     return (
         block.GetOutputPort("drive").Eval(context)[:6].copy(),
@@ -45,21 +46,21 @@ def test_torque_has_the_virtual_work_of_the_wrench(q):
     np.testing.assert_array_equal(displayed, wrench)
     step = 1e-6
     for k in range(6):
-        ahead = phantom.forward_kinematics(q + step * np.eye(6)[k])
-        behind = phantom.forward_kinematics(q - step * np.eye(6)[k])
+        ahead = arrays.forward_kinematics(q + step * np.eye(6)[k])
+        behind = arrays.forward_kinematics(q - step * np.eye(6)[k])
         translation = (ahead[4:] - behind[4:]) / (2 * step)
         # Small rotation in B from the quaternions: 2 dq q*.
         w, x = ahead[0], ahead[1:4]
         w0, x0 = behind[0], -behind[1:4]
         rotation = 2 * (w * x0 + w0 * x + np.cross(x, x0)) / (2 * step)
         work = wrench[:3] @ translation + wrench[3:] @ rotation
-        assert torque[k] - phantom.gravity_torque(q)[k] == pytest.approx(work, abs=1e-8)
+        assert torque[k] - arrays.gravity_torque(q)[k] == pytest.approx(work, abs=1e-8)
 
 
 @pytest.mark.parametrize("q", POSTURES)
 def test_zero_command_gives_gravity_compensation(q):
     torque, displayed = display(np.zeros(6), q)
-    np.testing.assert_allclose(torque, phantom.gravity_torque(q), atol=1e-15)
+    np.testing.assert_allclose(torque, arrays.gravity_torque(q), atol=1e-15)
     np.testing.assert_array_equal(displayed, 0)
 
 
@@ -75,15 +76,15 @@ def test_limited_wrench_keeps_its_direction(q):
     share = np.abs(torque[3:]) / [0.515, 0.515, 0.170]
     assert share.max() == pytest.approx(1.0, rel=1e-12)
     np.testing.assert_allclose(
-        torque, phantom.jacobian(q).T @ displayed + phantom.gravity_torque(q), atol=1e-12
+        torque, arrays.jacobian(q).T @ displayed + arrays.gravity_torque(q), atol=1e-12
     )
     np.testing.assert_array_equal(display(-wrench, q)[1], -displayed)
 
 
 def test_force_and_torque_are_limited_separately():
-    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME_POSTURE)
+    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME_POSTURE_RAD)
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
-    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE)
+    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE_RAD)
     np.testing.assert_allclose(displayed, [0, 0, 10.0, 0.17, 0.05, 0], rtol=1e-12)
 
 
@@ -94,13 +95,13 @@ def test_command_that_is_not_finite_displays_zero(bad, index):
     wrench[index] = bad
     torque, displayed = display(wrench, POSTURES[1])
     np.testing.assert_array_equal(displayed, 0)
-    np.testing.assert_allclose(torque, phantom.gravity_torque(POSTURES[1]), atol=1e-15)
+    np.testing.assert_allclose(torque, arrays.gravity_torque(POSTURES[1]), atol=1e-15)
 
 
 def test_fault_has_its_own_port_and_a_combined_one():
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
-    start = initial_display_state(POSTURES[1], DEVICE.numbers)
+    start = initial_display_state(POSTURES[1], DEVICE.parameters)
     block.GetInputPort("for_display").FixValue(context, start)
     for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.WRENCH)):
         block.GetInputPort("wrench_command").FixValue(context, wrench)
@@ -111,10 +112,10 @@ def test_fault_has_its_own_port_and_a_combined_one():
 
 
 def test_huge_command_is_limited_and_invalid_command_is_zero():
-    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME_POSTURE)
+    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME_POSTURE_RAD)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
-    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME_POSTURE)[1], 0)
+    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME_POSTURE_RAD)[1], 0)
 
 
 WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
@@ -123,14 +124,14 @@ WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, 7) displayed wrench and fault, and (N, 6) torque, per period."""
     device, J, drive = (
-        initial_display_state(POSTURES[1], DEVICE.numbers),
+        initial_display_state(POSTURES[1], DEVICE.parameters),
         np.empty((6, 6)),
         np.empty(27),
     )
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        step_display(command, device, DEVICE.numbers, PERIOD, J, drive)
+        step_display(command, device, DEVICE.parameters, PERIOD, J, drive)
         torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque
@@ -147,7 +148,7 @@ def test_wrench_fades_and_returns_without_a_step(part):
     np.testing.assert_array_equal(shown[:40, :6], commands[:40])
     np.testing.assert_allclose(np.diff(force[39:140]), -force[0] * PERIOD / STOP_TIME_S, rtol=1e-9)
     np.testing.assert_allclose(shown[140:160, :6], 0.0, atol=1e-12)
-    held = phantom.gravity_torque(POSTURES[1])
+    held = arrays.gravity_torque(POSTURES[1])
     np.testing.assert_allclose(torque[140:160], np.tile(held, (20, 1)), atol=1e-12)
     growth = np.diff(force[159:])
     assert 0.0 < growth.max() <= 37.5 * PERIOD / RESUME_TIME_S * (1 + 1e-9)
@@ -160,12 +161,14 @@ def test_wrench_fades_and_returns_without_a_step(part):
 def test_torque_returns_to_the_limit_of_the_strongest_motor():
     """Only the first wrist motor can display 0.3 N m: no step when the last is at its limit."""
     motors = np.array([0.3, 0.0, 0.0])
-    torque = np.linalg.solve(phantom.jacobian(POSTURES[1])[3:, 3:].T, motors)
+    torque = np.linalg.solve(arrays.jacobian(POSTURES[1])[3:, 3:].T, motors)
     commands = np.tile(np.r_[np.zeros(3), torque], (2600, 1))
     commands[40:160, 3] = np.nan
     shown, _ = displayed_over(commands, np.tile(POSTURES[1], (2600, 1)))
     growth = np.diff(np.linalg.norm(shown[159:, 3:6], axis=1))
     assert (
-        0.0 < growth.max() <= phantom.WRIST_TORQUE_LIMIT.max() * PERIOD / RESUME_TIME_S * (1 + 1e-9)
+        0.0
+        < growth.max()
+        <= phantom.PEAK_WRIST_TORQUES_N_M.max() * PERIOD / RESUME_TIME_S * (1 + 1e-9)
     )
     np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])

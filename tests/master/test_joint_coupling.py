@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import jacobian, pose_into
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
-from drake_teleop.station.slave.joint_commands import JointFollower
+from drake_teleop.station.slave.joint_commands import LeaderJointFollower
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
@@ -114,7 +114,7 @@ def test_open_clutch_holds_and_closed_clutch_returns(scenario):
 
 def test_follower_respects_position_and_speed_limits(scenario):
     slave = NominalSlave(scenario.slave)
-    follower = JointFollower(slave.arm, slave.start, 0.001)
+    follower = LeaderJointFollower(slave.arm, slave.start, 0.001)
     context = follower.CreateDefaultContext()
     port, command = follower.get_input_port(), follower.GetOutputPort("joint_command")
     port.FixValue(context, slave.arm.upper + 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -34,7 +35,7 @@ def test_sdf_has_the_kinematics_of_the_device(plant):
     for q in postures():
         plant.SetPositions(context, phantom.serial_joint_angles(q))
         X_BE = plant.GetFrameByName("stylus").CalcPoseInWorld(context)
-        pose = phantom.forward_kinematics(q)
+        pose = arrays.forward_kinematics(q)
         np.testing.assert_allclose(X_BE.translation(), pose[4:], atol=1e-14)
         sign = np.sign(X_BE.rotation().ToQuaternion().wxyz() @ pose[:4])
         np.testing.assert_allclose(
@@ -52,13 +53,13 @@ def test_sdf_has_the_mass_matrix_and_coriolis_forces_of_the_device(plant):
         plant.SetPositions(context, phantom.serial_joint_angles(q))
         plant.SetVelocities(context, SERIAL @ v)
         mass = SERIAL.T @ plant.CalcMassMatrix(context) @ SERIAL
-        np.testing.assert_allclose(mass, phantom.mass_matrix(q), atol=1e-11)
+        np.testing.assert_allclose(mass, arrays.mass_matrix(q), atol=1e-11)
         vdot = np.empty(6)
-        phantom.acceleration_into(
-            q, v, np.zeros(6), phantom.gravity_torque(q), no_friction, np.empty((2, 6, 6)), vdot
+        phantom.joint_acceleration_into(
+            q, v, np.zeros(6), arrays.gravity_torque(q), no_friction, np.empty((2, 6, 6)), vdot
         )
         coriolis = SERIAL.T @ plant.CalcBiasTerm(context)
-        np.testing.assert_allclose(-phantom.mass_matrix(q) @ vdot, coriolis, atol=1e-10)
+        np.testing.assert_allclose(-arrays.mass_matrix(q) @ vdot, coriolis, atol=1e-10)
 
 
 def test_sdf_lacks_only_the_counterweight_of_the_outer_link(plant):
@@ -66,7 +67,7 @@ def test_sdf_lacks_only_the_counterweight_of_the_outer_link(plant):
     for q in postures():
         plant.SetPositions(context, phantom.serial_joint_angles(q))
         held = -SERIAL.T @ plant.CalcGravityGeneralizedForces(context)
-        missing = phantom.gravity_torque(q) - held
+        missing = arrays.gravity_torque(q) - held
         lever = 0.0249 * 0.0325 / 2 - 0.1906 * 0.0527
         np.testing.assert_allclose(missing[2], 9.81 * lever * np.sin(q[2]), atol=1e-11)
         np.testing.assert_allclose(missing[[0, 1, 3, 4, 5]], 0, atol=1e-11)
@@ -75,9 +76,9 @@ def test_sdf_lacks_only_the_counterweight_of_the_outer_link(plant):
 def test_sdf_has_the_limits_of_the_device(plant):
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     independent = [0, 1, 3, 4, 5]
-    np.testing.assert_allclose(lower[independent], phantom.JOINT_LOWER[independent], atol=1e-6)
-    np.testing.assert_allclose(upper[independent], phantom.JOINT_UPPER[independent], atol=1e-6)
-    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.FIVE_BAR_RANGE, atol=1e-6)
+    np.testing.assert_allclose(lower[independent], phantom.JOINT_LOWER_RAD[independent], atol=1e-6)
+    np.testing.assert_allclose(upper[independent], phantom.JOINT_UPPER_RAD[independent], atol=1e-6)
+    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.FIVE_BAR_RANGE_RAD, atol=1e-6)
     np.testing.assert_allclose(
-        plant.GetEffortUpperLimits()[3:], phantom.WRIST_TORQUE_LIMIT, atol=1e-12
+        plant.GetEffortUpperLimits()[3:], phantom.PEAK_WRIST_TORQUES_N_M, atol=1e-12
     )

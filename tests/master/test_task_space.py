@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.data_sheets import FIGURES, JointFriction, Master
 from drake_teleop.station.master.device import MasterDevice
-from drake_teleop.station.master.electronics import read_pose_into
+from drake_teleop.station.master.electronics import encoder_pose_into
 from drake_teleop.station.master.force_display import initial_display_state, step_display
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData, replace
@@ -38,7 +38,7 @@ def smooth(model="omega_6", **figures) -> dynamics.HapticDevice:
 def advance(device, state, wrench, motor, steps, period=PERIOD) -> np.ndarray:
     state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
     for _ in range(steps):
-        dynamics.step_device(state, wrench, motor, device.numbers, period, work, stages)
+        dynamics.step_device(state, wrench, motor, device.parameters, period, work, stages)
     return state
 
 
@@ -133,7 +133,7 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
 
 def test_unactuated_axes_display_zero():
     for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
-        numbers, q = device(model).numbers, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
+        numbers, q = device(model).parameters, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
         start, drive = initial_display_state(q, numbers), np.empty(27)
         step_display(np.full(6, 100.0), start, numbers, PERIOD, np.empty((6, 6)), drive)
         assert np.linalg.norm(drive[12:15]) == pytest.approx(force, rel=1e-12)
@@ -149,7 +149,7 @@ def test_file_selects_device_and_overrides_figures():
     assert scenario.master.figures == expected
     named = ScenarioFromData({"master": {"model": "falcon"}}, "mine.yaml")
     np.testing.assert_array_equal(
-        named.master.device(*HAND).numbers, Master(model="falcon").device(*HAND).numbers
+        named.master.device(*HAND).parameters, Master(model="falcon").device(*HAND).parameters
     )
     for block, where in (
         ({"figures": {"friction": 0.1}}, "figures"),
@@ -189,9 +189,9 @@ def test_encoders_count_whole_steps_from_the_start():
     omega, steps = device(), np.repeat([1e-3, 0.01], 3)
     pose = np.empty(7)
     for away, counts in ((0.4, 0.0), (0.6, 1.0), (-2.3, -2.0)):
-        read_pose_into(Q + away * steps, Q, steps, omega.numbers, pose)
+        encoder_pose_into(Q + away * steps, Q, steps, omega.parameters, pose)
         np.testing.assert_allclose(pose, omega.forward_kinematics(Q + counts * steps), atol=1e-12)
-    read_pose_into(Q + V, Q, np.zeros(6), omega.numbers, pose)
+    encoder_pose_into(Q + V, Q, np.zeros(6), omega.parameters, pose)
     np.testing.assert_allclose(pose, omega.forward_kinematics(Q + V), atol=1e-12)
 
 

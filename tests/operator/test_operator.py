@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import phantom_arrays as arrays
 import pytest
 from operator_motion import intent_at
 from pydrake.common.eigen_geometry import Quaternion
@@ -27,7 +28,7 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 
-START = phantom.forward_kinematics(phantom.HOME_POSTURE)
+START = arrays.forward_kinematics(phantom.HOME_POSTURE_RAD)
 SEGMENTS = [
     MinimumJerk(t_start=0.1, duration=0.5, translation=[0.01, 0.02, -0.03], rotation=[0.3, 0, 0.2]),
     Sine(
@@ -127,7 +128,7 @@ def test_hand_pulls_towards_the_intent():
 
 def test_hand_torque_is_about_the_axis_of_the_error():
     """An error of 0.4 rad about an axis of B gives a torque about this axis."""
-    pose = phantom.forward_kinematics(np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]))
+    pose = arrays.forward_kinematics(np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]))
     axis = np.array([0.48, -0.6, 0.64])
     wanted = pose.copy()
     error = Quaternion(np.array([np.cos(0.2), *(np.sin(0.2) * axis)]))
@@ -158,7 +159,7 @@ def test_hand_yields_to_the_displayed_force(grip):
     model = Master(friction=viscous).device(hand.mass, hand.inertia)
     builder = DiagramBuilder()
     operator = builder.AddSystem(Operator(config, START))
-    master = builder.AddSystem(device.MasterDevice(period, model, phantom.HOME_POSTURE))
+    master = builder.AddSystem(device.MasterDevice(period, model, phantom.HOME_POSTURE_RAD))
     display = builder.AddSystem(ForceDisplay(period, model))
     for source, sink, port in (
         (master, operator, "pose_master"),

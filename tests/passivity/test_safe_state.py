@@ -16,7 +16,7 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.passivity.memory import WRENCH_LIMIT
 from drake_teleop.station.passivity.methods import (
     METHODS,
@@ -177,7 +177,7 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
         resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
         growth = np.diff(np.abs(result.felt), prepend=0.0)[resuming]
-        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME_TIME_S
+        assert growth.max(initial=0.0) < 1.001 * PEAK_FORCE_N * PERIOD / RESUME_TIME_S
     assert resumptions >= 5
 
 

@@ -26,7 +26,7 @@ from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
-from drake_teleop.station.slave.plant import arm_of_model_file
+from drake_teleop.station.slave.plant import read_arm_kinematics
 
 DT = 0.002
 NAMES = ("lift", "bend", "roll", "yaw")
@@ -76,7 +76,7 @@ def motion_of(table: np.ndarray, joints: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def test_pose_equals_drake(model: Path) -> None:
-    arm = arm_of_model_file(model, "tool")
+    arm = read_arm_kinematics(model, "tool")
     assert arm is not None and arm.joint_names == NAMES
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(model))
@@ -112,7 +112,7 @@ class Joints(StreamStub):
 
 
 def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
-    arm = arm_of_model_file(model, "tool")
+    arm = read_arm_kinematics(model, "tool")
     assert arm is not None
     t, *joints = moved(0.4)
     bad = Part(POSE, 0, 0.0, np.zeros(7)), Part(JOINTS, 0, 0.0, np.full(3, 0.1))
@@ -135,7 +135,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
 
 
 def test_options_for_joints_are_checked_together(model: Path) -> None:
-    arm, address = arm_of_model_file(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
+    arm, address = read_arm_kinematics(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
     with pytest.raises(DrakeTeleopError, match="joint positions need the model of the arm"):
         open_source(address, None, rate_hz=500.0)
     with pytest.raises(DrakeTeleopError, match="delivers no joint positions for --model"):
@@ -149,7 +149,7 @@ def test_options_for_joints_are_checked_together(model: Path) -> None:
 @pytest.mark.parametrize("box", ["netft", "zenoh"])
 def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_path: Path) -> None:
     """Wrench by either protocol and joints by ROS 2 come from other processes."""
-    arm = arm_of_model_file(model, "tool")
+    arm = read_arm_kinematics(model, "tool")
     assert arm is not None
     _, *joints = moved(40.0)
     motion = np.split(motion_of(arm.table, tuple(joints)), 3, axis=1)

@@ -25,7 +25,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
-from drake_teleop.station.slave.joint_commands import SlaveMonitor, ik_method_name
+from drake_teleop.station.slave.joint_commands import JointRangeMonitor, ik_method_name
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
@@ -156,7 +156,9 @@ def test_tool_from_mass_and_shapes():
     touching = AddSlavePlant(
         DiagramBuilder(), Slave(tool=Tool(mass=2.0, shapes=shapes[:1])), SheetSpring()
     )
-    np.testing.assert_allclose(touching.contact_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15)
+    np.testing.assert_allclose(
+        touching.contact.compiled_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15
+    )
 
 
 def test_only_load_makes_contact(folder, tmp_path):
@@ -167,8 +169,8 @@ def test_only_load_makes_contact(folder, tmp_path):
     for link, watched in (("l7", 0), ("hand", 1)):  # a ball that does not say how stiff it is
         path.write_text(text.replace(f'<link name="{link}">', f'<link name="{link}">{ball}'))
         contact = AddSlavePlant(DiagramBuilder(), slave, SheetSpring()).contact
-        assert (len(contact.watched), len(contact.shapes)) == (watched, 1 + watched)
-        assert (len(contact.pairs), contact.beyond) == (1, "")
+        assert (len(contact.monitored_pairs), len(contact.tool_shapes)) == (watched, 1 + watched)
+        assert (len(contact.compiled_pairs), contact.drake_contact_reason) == (1, "")
 
 
 def test_model_directives_find_files_and_packages(folder, tmp_path):
@@ -333,7 +335,7 @@ def test_tip_is_between_fingers_of_gripper(folder, scenario):
 def test_joint_may_overshoot_limit_by_1_percent(scenario, beyond, stops, side):
     """An arm that is commanded to its limit overshoots before its mechanical stop."""
     arm = NominalSlave(scenario.slave).arm
-    monitor = SlaveMonitor(arm, 1e-3)
+    monitor = JointRangeMonitor(arm, 1e-3)
     context, q = monitor.CreateDefaultContext(), np.array(HOME)
     limit = arm.upper[3] if side > 0 else arm.lower[3]
     q[3] = limit + side * beyond * (arm.upper[3] - arm.lower[3])
@@ -361,7 +363,9 @@ def free(scenario):
 @pytest.mark.slow
 def test_redundant_arm_approaches_posture_at_pull_rate(scenario, free):
     period = 1.0 / scenario.rates.hand_hz
-    assert free[0] == pytest.approx(np.exp(-NumericInverseKinematics.PULL * period), abs=1e-5)
+    assert free[0] == pytest.approx(
+        np.exp(-NumericInverseKinematics.POSTURE_RATE_PER_S * period), abs=1e-5
+    )
     assert free[1] < 0.9990
 
 

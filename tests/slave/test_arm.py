@@ -11,8 +11,8 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import (
-    FRAME_STATE_SIZE,
     IS_PRISMATIC_COLUMN,
+    SENSOR_MOTION_SIZE,
     forward_dynamics,
     forward_kinematics,
     inverse_dynamics,
@@ -72,7 +72,7 @@ def test_pose_and_jacobian_equal_the_plant(case):
 def test_motion_of_the_sensor_equals_the_plant(case):
     plant, frame_S, arm = case
     context = plant.CreateDefaultContext()
-    out = np.full(FRAME_STATE_SIZE, np.nan)
+    out = np.full(SENSOR_MOTION_SIZE, np.nan)
     for q, v, vdot in random_states(arm):
         plant.SetPositions(context, plant_vector(plant, arm, q))
         plant.SetVelocities(context, plant_vector(plant, arm, v))

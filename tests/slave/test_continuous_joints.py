@@ -26,10 +26,10 @@ from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_limits
 from drake_teleop.station.slave.home import positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, InverseKinematics
-from drake_teleop.station.slave.joint_commands import JointFollower, SlaveMonitor
+from drake_teleop.station.slave.joint_commands import JointRangeMonitor, LeaderJointFollower
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
     NumericInverseKinematics,
     find_posture,
@@ -76,7 +76,7 @@ def arm_of(text):
     (instance,) = Parser(plant).AddModelsFromString(text, "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("l0"))
     plant.Finalize()
-    return with_all_limits(ArmModelFromPlant(plant, instance, "ft"), "arm")
+    return fill_missing_limits(ArmModelFromPlant(plant, instance, "ft"), "arm")
 
 
 ARMS = {chain: arm_of(urdf(chain))[0] for chain in POSTURES}
@@ -213,7 +213,7 @@ def test_limits_of_a_joint(kind, limit, expected, words):
      (2, np.inf, False), (4, -np.inf, False)],
 )  # fmt: skip
 def test_monitor_accepts_any_finite_angle_of_an_endless_joint(joint, value, passes):
-    system = SlaveMonitor(ARMS[SEVEN], 0.01)
+    system = JointRangeMonitor(ARMS[SEVEN], 0.01)
     context = system.CreateDefaultContext()
     state = np.zeros(14)
     state[joint] = value
@@ -227,7 +227,7 @@ def test_monitor_accepts_any_finite_angle_of_an_endless_joint(joint, value, pass
 
 def test_endless_joints_follow_a_leader_over_many_turns():
     arm = ARMS[SEVEN]
-    system = JointFollower(arm, np.full(7, 30.0) * np.isinf(arm.upper), 1.0)
+    system = LeaderJointFollower(arm, np.full(7, 30.0) * np.isinf(arm.upper), 1.0)
     context = system.CreateDefaultContext()
     system.GetInputPort("leader_joints").FixValue(context, np.full(7, 32.0))
     np.testing.assert_allclose(

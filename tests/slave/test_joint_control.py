@@ -10,7 +10,7 @@ from drake_teleop.station.slave.arm import inverse_dynamics
 from drake_teleop.station.slave.joint_control import (
     JointControl,
     JointControlConfig,
-    joint_control_torque,
+    computed_torque_into,
 )
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -23,7 +23,7 @@ def arm():
 
 def torque(arm, command, q, v):
     config, out = JointControlConfig(), np.zeros(6)
-    joint_control_torque(
+    computed_torque_into(
         arm.table,
         np.asarray(command, float),
         np.concatenate([q, v]),

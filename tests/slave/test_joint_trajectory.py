@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.slave.joint_commands import JointTrajectory
+from drake_teleop.station.slave.joint_commands import ExcitationCommand
 
 
 def test_trajectory_rests_before_and_after_one_period():
     rng = np.random.default_rng(0)
     trajectory = FourierTrajectory(rng.normal(size=6), *rng.normal(size=(2, 6, 2)), 0.5)
     start, period = 1.25, trajectory.period
-    block = JointTrajectory(trajectory, start)
+    block = ExcitationCommand(trajectory, start)
     context = block.CreateDefaultContext()
     for time, played in (
         (0.0, 0.0),

@@ -332,9 +332,9 @@ def test_file_in_working_folder_is_outside_model(
 
 def test_too_large_files_are_rejected(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
-    monkeypatch.setattr(model_references, "_MAX_TEXT", 400)
+    monkeypatch.setattr(model_references, "_MAX_TEXT_BYTES", 400)
     assert any("exceeds the limit" in words for words in parse(path).assumptions)
-    monkeypatch.setattr(model_references, "_MAX_TEXT", 100)
+    monkeypatch.setattr(model_references, "_MAX_TEXT_BYTES", 100)
     with pytest.raises(DrakeTeleopError, match=r"a\.urdf: exceeds the limit of"):
         parse(path)
 

@@ -19,10 +19,13 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, repair_inertia
+from drake_teleop.station.slave.model.link_repair import (
+    nearest_possible_inertia,
+    repair_inertia,
+)
 from drake_teleop.station.slave.model.model_numbers import check_quantities
 from drake_teleop.station.slave.model.repair_report import RepairReport
-from drake_teleop.station.slave.model.urdf_repair import _has_colour, dependent_joints
+from drake_teleop.station.slave.model.urdf_repair import _has_colour, find_dependent_parts
 from drake_teleop.station.slave.models import ParseModel, ParseScene
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
@@ -433,7 +436,7 @@ def test_coupled_joints_and_floating_links_are_dependent(inside, expected, paren
         f'<joint name="f" type="floating">{ends}</joint></r>'
     )
     floating = {} if parent == "world" else {"c": "floats on l2"}
-    assert dependent_joints(root) == expected | floating
+    assert find_dependent_parts(root) == expected | floating
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,14 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.joint_control import (
     JointControl,
     JointControlConfig,
-    joint_control_torque,
+    computed_torque_into,
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
 from drake_teleop.station.slave.sampled_servo import (
     SampledServo,
+    predict_torque_line,
     samples_per_event,
-    torque_line_into,
 )
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
@@ -107,8 +107,8 @@ def test_one_sample_equals_joint_control_exactly():
         command = slave.start + random.normal(0.0, 0.05, n)
         state = np.concatenate([slave.start, np.zeros(n)]) + random.normal(0.0, 0.3, 2 * n)
         scratch, line = np.zeros(3 * n), np.zeros(3 * n)
-        joint_control_torque(slave.arm.table, command, state, *servo, scratch, torque)
-        torque_line_into(
+        computed_torque_into(slave.arm.table, command, state, *servo, scratch, torque)
+        predict_torque_line(
             slave.arm.table, command, state, np.zeros(2), servo, slave.physics_of_plant, 1, 5e-4,
             scratch, line,
         )  # fmt: skip
@@ -122,7 +122,7 @@ def test_line_stays_within_torque_limits_and_survives_invalid_command():
     line = np.zeros(3 * n)
 
     def torques(command):
-        torque_line_into(
+        predict_torque_line(
             arm.table, command, rest, np.zeros(2), servo, slave.physics_of_plant, 5, 1e-4,
             np.zeros(3 * n), line,
         )  # fmt: skip

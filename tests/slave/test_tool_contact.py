@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, min_distance_of_boxes
+from drake_teleop.station.environment.point_contact import FindContactPairs, min_distance_of_boxes
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -51,12 +51,13 @@ def test_wrench_equals_drakes(leaf, most):
         sheet = np.array([0.01 * random.uniform(-1, 1), 0.1 * random.normal()])
         plant.SetPositions(context, slave.instance, q)
         plant.SetVelocities(context, slave.instance, v)
-        plant.SetPositions(context, slave.sheet_instance, sheet[:1])
-        plant.SetVelocities(context, slave.sheet_instance, sheet[1:])
+        plant.SetPositions(context, slave.contact.leaf_instance, sheet[:1])
+        plant.SetVelocities(context, slave.contact.leaf_instance, sheet[1:])
         expected = drake_wrench(plant, context, slave.tool)
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -88,7 +89,8 @@ def test_peg_in_slot_equals_drakes_with_many_pairs():
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
             slave.arm.table,
-            *slave.contact.compiled_law_arguments,
+            slave.contact.compiled_pairs,
+            slave.contact.joint_table,
             np.zeros(6),
             q,
             v,
@@ -108,7 +110,8 @@ def test_applied_wrench_is_shifted_to_world_origin():
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
     environment_wrench(
         slave.arm.table,
-        *slave.contact.compiled_law_arguments,
+        slave.contact.compiled_pairs,
+        slave.contact.joint_table,
         push,
         q,
         0 * q,
@@ -131,12 +134,12 @@ def test_other_shapes_are_monitored_by_bounding_boxes():
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
     plant.Finalize()
     inspector, from_S = scene_graph.model_inspector(), RigidTransform([0.0, 0.0, 0.2])
-    pairs = ContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
-    assert len(pairs.known) == 0
-    assert "spheres on boxes only, not a Box on a Sphere" in pairs.unknown
-    np.testing.assert_allclose(pairs.watched[0, :3], [0.0, 0.3, 0.2])
-    np.testing.assert_allclose(pairs.watched[0, 16:19], 0.1)
-    np.testing.assert_allclose(np.sort(pairs.watched[0, 37:]), [0.5, 1.0, 2.0])
+    pairs = FindContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
+    assert len(pairs.compiled_pairs) == 0
+    assert "spheres on boxes only, not a Box on a Sphere" in pairs.monitoring_reason
+    np.testing.assert_allclose(pairs.monitored_pairs[0, :3], [0.0, 0.3, 0.2])
+    np.testing.assert_allclose(pairs.monitored_pairs[0, 16:19], 0.1)
+    np.testing.assert_allclose(np.sort(pairs.monitored_pairs[0, 37:]), [0.5, 1.0, 2.0])
 
 
 def test_distance_of_separate_boxes():

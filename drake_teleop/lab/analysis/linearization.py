@@ -44,7 +44,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without_parts
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.joint_commands import AUTOMATIC_METHOD, ik_method_name
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, ik_method_name
 from drake_teleop.station.slave.plant import ARM_INSTANCE_NAME, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
@@ -494,7 +494,7 @@ class _PeriodSimulator:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display_state(self._device.coordinates_for_display(q), self._device.numbers),
+            initial_display_state(self._device.coordinates_for_display(q), self._device.parameters),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
@@ -595,7 +595,7 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
         slave__friction=[],
         load_estimator__enabled=False,
         # The closed form, if the arm has one, has no state.
-        slave__inverse_kinematics=AUTOMATIC_METHOD,
+        slave__inverse_kinematics=AUTOMATIC_IK_METHOD,
     )
 
 

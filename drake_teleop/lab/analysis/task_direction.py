@@ -123,7 +123,7 @@ def _wall_stiffness(scenario: Scenario) -> float:
     wall = scenario.surroundings
     if not isinstance(wall, Wall):
         return 0.0
-    pairs = AddSlavePlant(DiagramBuilder(), scenario.slave, wall).contact_pairs
+    pairs = AddSlavePlant(DiagramBuilder(), scenario.slave, wall).contact.compiled_pairs
     return float(pairs[:, STIFFNESS_COLUMN].sum())
 
 

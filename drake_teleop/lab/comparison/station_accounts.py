@@ -18,7 +18,7 @@ from drake_teleop.station.passivity.energy import energy_balance, port_work
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import (
-    GRAVITY_COLUMN,
+    LAST_ROW_GRAVITY_COLUMN,
     inverse_dynamics,
     jacobian,
     pose_into,
@@ -76,7 +76,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     held = scenario.force_scaling.gripper_phi
     of_gripper = arm.phi_load if held is None else np.asarray(held)
     R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
-    gravity = arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3] @ R_WS[:, 0]
+    gravity = arm.table[-1, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3] @ R_WS[:, 0]
     inertias, weights = np.split(np.array(scenario.force_scaling.scales().load_scales), 2)
     kept, excess = (
         part[0] * of_gripper + part[1] * (arm.phi_load - of_gripper)

@@ -21,7 +21,7 @@ from drake_teleop.lab.excitation.link_gradients import (
     rotate_to_world,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, inverse_dynamics, link_motions
+from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, inverse_dynamics, link_motions
 
 LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
@@ -386,4 +386,4 @@ def _segment_distance(first, second, nearest):
 
 
 def empty_motions(samples: int, joints: int) -> Array:
-    return np.empty((samples, joints + 1, FRAME_STATE_SIZE))
+    return np.empty((samples, joints + 1, SENSOR_MOTION_SIZE))

@@ -22,7 +22,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, IS_PRISMATIC_COLUMN
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SIZE
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
@@ -116,7 +116,7 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)
-    still = np.zeros(FRAME_STATE_SIZE)
+    still = np.zeros(SENSOR_MOTION_SIZE)
     for row in range(n, -1, -1):
         motion, seed = motions[row], seeds[row]
         inboard = motions[row - 1] if row > 0 else still

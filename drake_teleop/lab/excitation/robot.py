@@ -24,7 +24,11 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
+from drake_teleop.station.slave.arm_from_plant import (
+    ArmModelFromPlant,
+    check_arm_lengths,
+    fill_missing_limits,
+)
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
@@ -81,13 +85,13 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         parsed = ParseSlave(plant, scenario.slave)
         if scenario.surroundings is not None:
             AddEnvironment(plant, scenario.surroundings)
-        folders.extend(parsed.folders)
+        folders.extend(parsed.mesh_folders)
         return parsed.instance, parsed.sensor_frame
 
     slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
     own = scenario.slave.model != ""
     scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
-    scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
+    scene.arm, _ = fill_missing_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
         scene,
@@ -124,13 +128,13 @@ def RobotFromModel(
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
-        folders.append(model.folder)
+        folders.append(model.mesh_folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
     with translate_drake_errors(path):
         arm = _read_arm(parse)
-    check_size(arm, str(path))
+    check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load
@@ -154,7 +158,7 @@ def RobotFromModel(
     with translate_drake_errors(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
-    scene.arm, completed = with_all_limits(
+    scene.arm, completed = fill_missing_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
     )
     return _make_robot(

@@ -82,7 +82,7 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
     anchored, rank = shapes.anchored_bodies(), 0
     triangles, colours = [], []
     for body in sorted(shapes.moving_bodies() | anchored, key=int):
-        hulls = shapes.hulls(body, visual=True)
+        hulls = shapes.hull_points_W(body, visual=True)
         if body in shapes.tool_bodies:
             colour = _TOOL_COLOUR
         elif body in anchored:

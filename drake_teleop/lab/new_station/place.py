@@ -43,7 +43,7 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.home import R_WS_HOME, positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_texts
+from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_warnings
 
 #: Edges of the walls that are tried, the first preferred [m].
 WALL_EDGES_M = (0.4, 0.25, 0.15)
@@ -225,7 +225,7 @@ def _rows_to_solve(
         clear = np.ones(len(few), dtype=bool)
         for k, row in enumerate(few):
             shapes.move_to(postures.q[row])
-            clear[k] = not overlap_texts(shapes, of_arm=True)
+            clear[k] = not overlap_warnings(shapes, of_arm=True)
         yield few[clear]
 
 

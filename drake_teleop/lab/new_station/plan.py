@@ -24,10 +24,10 @@ from drake_teleop.lab.new_station.place import (
     tool_frame_advice,
 )
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
-from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_texts
+from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
@@ -116,7 +116,7 @@ def plan_station(
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
     room = _PHANTOM_HALF_SIZE_M if figures is None else min(figures.size) / 2.0
-    peak = FORCE_LIMIT if figures is None else figures.peak_force
+    peak = PEAK_FORCE_N if figures is None else figures.peak_force
     translation_scale = _floor_two_digits(min(place.half / room, 1.0))
     force_scale = min(
         peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
@@ -140,7 +140,7 @@ def plan_station(
         tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
         axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
-        overlaps=tuple(overlap_texts(shapes, of_arm=True)),
+        overlaps=tuple(overlap_warnings(shapes, of_arm=True)),
         plane=plane,
         weak_joints=weak_joints,
         shapes=shapes,
@@ -184,7 +184,9 @@ def _tool_axis(shapes: PostureShapes, load: Array) -> str:
 
 def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
-    link_end = extent_beyond_sensor(shapes, shapes.sensor_bodies() - shapes.tool_bodies, axis)
+    link_end = extent_beyond_sensor(
+        shapes, shapes.bodies_welded_to_sensor() - shapes.tool_bodies, axis
+    )
     return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
@@ -204,7 +206,7 @@ def _stand_in_tool(axis: str, length: float) -> Tool:
 
 
 def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
-    end = extent_beyond_sensor(shapes, shapes.sensor_bodies() - {shapes.tool_body}, axis)
+    end = extent_beyond_sensor(shapes, shapes.bodies_welded_to_sensor() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 
 

@@ -28,7 +28,7 @@ from drake_teleop.lab.comparison.one_dof import (
 from drake_teleop.lab.studies.design import Values
 from drake_teleop.lab.tuning.stated_set import StatedSet
 from drake_teleop.station.master.data_sheets import FIGURES
-from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.master.phantom import PEAK_FORCE_N
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.tdpa import charged_tdpa_config
@@ -253,7 +253,7 @@ def short_task(round_trip: float) -> Task:
 def press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
-    peak = FORCE_LIMIT if sheet is None else sheet.peak_force
+    peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
     return min(_MAX_DEPTH, _DEVICE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 

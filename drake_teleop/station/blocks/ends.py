@@ -6,18 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteStateIndex,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import DoubleOnly, weak_callback
-from drake_teleop.common.numeric import finite_array
+from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.channel.channel import (
     MIN_TIMEOUT_S,
     PORTS_SIGNAL_SIZE,
@@ -30,7 +23,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
-class _PassivityEndBlock(DoubleOnly, LeafSystem):
+class _PassivityEndBlock(SteppedBlock):
     """Base class of both ends of a passivity method.
 
     Args:
@@ -67,43 +60,23 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         # Ends, command, port energies, rendered wrench and contact flag, packet.
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
-        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUTS]
-        self._groups = [int(self.DeclareDiscreteState(part)) for part in results[:3]]
-        step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(
-                allocate=lambda: AbstractValue.Make([np.array(part) for part in results]),
-                calc=weak_callback(self._calc_step),
-            ),
-            {self.all_input_ports_ticket(), self.xd_ticket()},
-        )
-        self._step = step.cache_index()
+        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUT_PORTS]
+        step = self._declare_step(results, 3, period)
         calculate = weak_callback(self._calc_packet)
-        self.DeclareVectorOutputPort("packet", PACKET_SIZE, calculate, {step.ticket()})
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self._declare_outputs(step.ticket())
+        self.DeclareVectorOutputPort("packet", PACKET_SIZE, calculate, {step})
+        self._declare_outputs(step)
 
-    def _calc_step(self, context: Context, step: AbstractValue) -> None:
-        parts = step.get_mutable_value()
-        for part, group in zip(parts, self._groups, strict=False):
-            part[:] = context.get_discrete_state(group).value()
+    def _advance(self, context: Context, results: list[Array]) -> None:
         packet = self._received.Eval(context)
         inputs = [
             port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
             for port in self._ports
         ]
-        self._step_method(inputs, np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5), *parts)
-
-    def _step_results(self, context: Context) -> list[Any]:
-        results: list[Any] = self.get_cache_entry(self._step).Eval(context)
-        return results
+        received, is_fresh = np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
+        self._step_method(inputs, received, is_fresh, *results)
 
     def _calc_packet(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._step_results(context)[-1])
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._step_results(context), self._groups, strict=False):
-            discrete_state.set_value(group, part)
 
 
 class PassivityAtMaster(_PassivityEndBlock):
@@ -124,7 +97,7 @@ class PassivityAtMaster(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUTS = (("pose_command", 7), ("hand_wrench_E", 6))
+    _INPUT_PORTS = (("pose_command", 7), ("hand_wrench_E", 6))
 
     def _declare_outputs(self, step: Any) -> None:
         calculate = weak_callback(self._calc_wrench)
@@ -163,13 +136,13 @@ class PassivityAtSlave(_PassivityEndBlock):
     """
 
     __slots__ = ()
-    _INPUTS = (
+    _INPUT_PORTS = (
         *(("wrench_B", 6), ("load_wrench_B", 6), ("pose_slave", 7)),
         *(("saturated", 1), ("contact", 1)),
     )
 
     def _declare_outputs(self, step: Any) -> None:
-        self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._groups[1]))
+        self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
     def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,

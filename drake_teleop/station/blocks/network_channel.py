@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteStateIndex,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import DoubleOnly, weak_callback
+from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
 
 
-class NetworkChannel(DoubleOnly, LeafSystem):
+class NetworkChannel(SteppedBlock):
     """Network that transmits a vector in every period; a packet takes at least one period.
 
     .. pydrake_system::
@@ -70,38 +63,17 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         parts = network.initial_network_state(self._parameters, np.zeros(size))
         state = [*parts, np.zeros(1), np.zeros(size + 1)]
         self._packet = self.DeclareVectorInputPort("packet", size)
-        self._groups = [int(self.DeclareDiscreteState(part)) for part in state]
-        step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(
-                allocate=lambda: AbstractValue.Make([np.array(part) for part in state]),
-                calc=weak_callback(self._calc_step),
-            ),
-            {self.all_input_ports_ticket(), self.xd_ticket()},
-        )
-        self._step = step.cache_index()
-        self.DeclareStateOutputPort("received", DiscreteStateIndex(self._groups[-1]))
+        step = self._declare_step(state, len(state), period)
+        self.DeclareStateOutputPort("received", DiscreteStateIndex(self._states[-1]))
         calculate = weak_callback(self._calc_arriving)
-        self.DeclareVectorOutputPort("arriving", size + 1, calculate, {step.ticket()})
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareVectorOutputPort("arriving", size + 1, calculate, {step})
 
-    def _calc_step(self, context: Context, step: AbstractValue) -> None:
-        parts = step.get_mutable_value()
-        for part, group in zip(parts, self._groups, strict=True):
-            part[:] = context.get_discrete_state(group).value()
-        receiver, in_transit, count, received = parts
+    def _advance(self, context: Context, results: list[Array]) -> None:
+        receiver, in_transit, count, received = results
         k, line = int(count[0]), (receiver, in_transit)
         network.send_packet(self._parameters, line, k, self._packet.Eval(context))
         _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
         count[0], received[-1] = k + 1, fresh
 
-    def _next_state_parts(self, context: Context) -> list[Array]:
-        parts: list[Array] = self.get_cache_entry(self._step).Eval(context)
-        return parts
-
     def _calc_arriving(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._next_state_parts(context)[-1])
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._next_state_parts(context), self._groups, strict=True):
-            discrete_state.set_value(group, part)
+        output.SetFromVector(self._step_results(context)[-1])

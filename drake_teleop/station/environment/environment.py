@@ -23,10 +23,10 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloa
 class FloorStand(NamedTuple):
     """Box on the floor that 3D replays show below an object: sizes and centre in W [m]."""
 
-    along_x: float
-    along_y: float
-    x: float
-    y: float
+    size_x: float
+    size_y: float
+    centre_x: float
+    centre_y: float
     height: float
 
 

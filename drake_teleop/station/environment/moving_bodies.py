@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -23,6 +22,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     cross,
@@ -34,12 +34,10 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 
-Array = NDArray[np.float64]
-
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 (
-    _PARENT_COLUMN,
-    _KIND_COLUMN,
+    _PARENT_ROW_COLUMN,
+    _JOINT_TYPE_COLUMN,
     _POSITION_INDEX_COLUMN,
     _VELOCITY_INDEX_COLUMN,
     _AXIS_COLUMN,
@@ -52,7 +50,7 @@ NUM_JOINT_COLUMNS = 21
 BODY_STATE_SIZE = 13
 
 
-def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
+def MakeJointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
     """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
     Columns: 0 row of the parent body, or -1 if it is anchored; 1 type of joint; 2 and 3 first
@@ -122,14 +120,14 @@ def _quaternion_at(x, i):
 def poses_and_twists_into(joints, state, out):
     """Write pose and twist of m bodies at the plant's state [q; v] into `out` (m, 13).
 
-    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is a `JointTable`.
+    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is from `MakeJointTable`.
     """
     still = (0.0, 0.0, 0.0)
     for k in range(joints.shape[0]):
         row = joints[k]
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
-        if row[_PARENT_COLUMN] >= 0.0:
-            above = out[int(row[_PARENT_COLUMN])]
+        if row[_PARENT_ROW_COLUMN] >= 0.0:
+            above = out[int(row[_PARENT_ROW_COLUMN])]
             turn, place = _quaternion_at(above, 0), vector_at(above, 4)
             spin, speed = vector_at(above, 7), vector_at(above, 10)
         # From parent to F.
@@ -140,7 +138,7 @@ def poses_and_twists_into(joints, state, out):
         q, v, kind, axis = (
             int(row[_POSITION_INDEX_COLUMN]),
             int(row[_VELOCITY_INDEX_COLUMN]),
-            row[_KIND_COLUMN],
+            row[_JOINT_TYPE_COLUMN],
             vector_at(row, _AXIS_COLUMN),
         )
         if kind == _REVOLUTE_JOINT:
@@ -188,13 +186,13 @@ def _quaternion_rate(spin, turn):
 def interpolate_joint_state(joints, h, u, start, end, out):
     """Write the state [q; v] at the fraction u of a step of h [s] into `out` (Hermite cubics).
 
-    `start` and `end` are the plant's states at both ends of the step, `joints` a `JointTable`.
+    `start` and `end` are the plant's states at both ends, `joints` is from `MakeJointTable`.
     """
     for k in range(joints.shape[0]):
         q, v, kind = (
             int(joints[k, _POSITION_INDEX_COLUMN]),
             int(joints[k, _VELOCITY_INDEX_COLUMN]),
-            joints[k, _KIND_COLUMN],
+            joints[k, _JOINT_TYPE_COLUMN],
         )
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
             out[q], out[v] = _interpolate_hermite(h, u, start[q], start[v], end[q], end[v])

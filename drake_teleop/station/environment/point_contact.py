@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
@@ -20,6 +19,7 @@ from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     dot,
@@ -32,11 +32,9 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 
-Array = NDArray[np.float64]
-
-#: Columns of `ShapePairs.known`: stiffness; static and dynamic friction; row of the box's body.
-STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_COLUMN = 22, slice(24, 26), 27
-#: Number of columns of `ShapePairs.known` and `ShapePairs.watched`.
+#: Columns of `ShapePairs.compiled_pairs`: stiffness; both frictions; row of the box's body.
+STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_ROW_COLUMN = 22, slice(24, 26), 27
+#: Number of columns of `ShapePairs.compiled_pairs` and `ShapePairs.monitored_pairs`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
 _MIN_SLIP_SPEED_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
@@ -46,22 +44,22 @@ class ShapePairs(NamedTuple):
     """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
-        known: (k, 28), pairs of a sphere and a box; columns: 0-2 centre of the sphere in S [m],
-            3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
-            the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
+        compiled_pairs: (k, 28), pairs of a sphere and a box; columns: 0-2 centre of the sphere in
+            S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead
+            of W if it moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
             moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
-            and dynamic friction, 26 slip speed [m/s], 27 row of the body in a `JointTable`, or -1.
-        watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
-            tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
-        unknown: reason why the first pair of `watched` is not in `known`.
+            and dynamic friction, 26 slip speed [m/s], 27 row of the body in the joint table, or -1.
+        monitored_pairs: (l, 40), bounding boxes of the other pairs. As above, with 0-2 centre of
+            the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
+        monitoring_reason: why the first pair of `monitored_pairs` is not in `compiled_pairs`.
     """
 
-    known: Array
-    watched: Array
-    unknown: str
+    compiled_pairs: Array
+    monitored_pairs: Array
+    monitoring_reason: str
 
 
-def ContactPairs(
+def FindContactPairs(
     plant: MultibodyPlant,
     inspector: SceneGraphInspector,
     tool: Mapping[GeometryId, RigidTransform],
@@ -74,15 +72,15 @@ def ContactPairs(
     Args:
         tool: pose X_SBody of its body, for each shape of the tool.
         slip: sliding speed of full friction [m/s], the plant's stiction tolerance.
-        moving: body index of each row of a `JointTable`.
+        moving: body index of each row of a joint table (`MakeJointTable`).
 
     Raises:
         DrakeTeleopError: for an unbounded shape.
     """
     context = plant.CreateDefaultContext()
-    known: list[Array] = []
-    watched: list[Array] = []
-    unknown = ""
+    compiled_pairs: list[Array] = []
+    monitored_pairs: list[Array] = []
+    monitoring_reason = ""
     touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
     for body in map(plant.get_body, touched):
         row = moving.index(int(body.index())) if int(body.index()) in moving else -1
@@ -101,19 +99,21 @@ def ContactPairs(
                     )
                     half = np.array(edges.size()) / 2
                     place = [X_SShape.translation(), [sphere.radius()]]
-                    known.append(_pair_row(place, X_Other, half, [direction, law, [slip, row]]))
+                    compiled_pairs.append(
+                        _pair_row(place, X_Other, half, [direction, law, [slip, row]])
+                    )
                 except DrakeTeleopError as beyond:
-                    unknown = unknown or str(beyond)
+                    monitoring_reason = monitoring_reason or str(beyond)
                     own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
                     X_SBox, X_Other = X_SShape @ own_box.pose(), X_Other @ box.pose()
                     place = [X_SBox.translation(), [0.0]]
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip, row], *turned]
-                    watched.append(_pair_row(place, X_Other, box.half_width(), last))
+                    monitored_pairs.append(_pair_row(place, X_Other, box.half_width(), last))
     return ShapePairs(
-        np.array(known).reshape(len(known), NUM_PAIR_COLUMNS),
-        np.array(watched).reshape(len(watched), NUM_MONITORED_COLUMNS),
-        unknown,
+        np.array(compiled_pairs).reshape(len(compiled_pairs), NUM_PAIR_COLUMNS),
+        np.array(monitored_pairs).reshape(len(monitored_pairs), NUM_MONITORED_COLUMNS),
+        monitoring_reason,
     )
 
 
@@ -188,7 +188,7 @@ def depth_of_sphere_in_box(
     """Return the depth of a sphere in a box [m], below 0 if they are apart.
 
     Args:
-        pair: (28,) row of `ShapePairs.known`.
+        pair: (28,) row of `ShapePairs.compiled_pairs`.
         deflection: deflection of the sheet spring [m].
         normal: (6,) output, written if they touch: direction out of the box in W (3), point of
             contact in W [m] (3).
@@ -237,8 +237,8 @@ def min_distance_of_boxes(
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `ShapePairs.watched`; `box` (28,) is its first part with the present
-    pose of the environment's box. The bound is the largest gap along an edge of either box.
+    `pair` (40,) is a row of `ShapePairs.monitored_pairs`; `box` (28,) is its first part with the
+    present pose of the environment's box. The bound is the largest gap along an edge of either box.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
     between = plus(between, apply_matrix(R, vector_at(pair, 0)))
@@ -273,8 +273,8 @@ def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
-    `pair` is a row of `ShapePairs.known`, `x` the depth [m], `normal` the direction out of the
-    box, `velocity` that of the sphere at the contact, relative to the box [m/s].
+    `pair` is a row of `ShapePairs.compiled_pairs`, `x` the depth [m], `normal` the direction out of
+    the box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

@@ -58,7 +58,7 @@ class SheetSpring(Environment):
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
-    def largest_small_deflection(self) -> float:
+    def max_linear_deflection(self) -> float:
         """Largest deflection for which the linear model is valid, 10 % of the length [m]."""
         return 0.1 * self.length
 

@@ -24,9 +24,9 @@ from drake_teleop.station.environment.environment import ContactMaterial, Enviro
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
 #: (E) is as high as the nut above it permits in the deepest slot.
-PEG_RADIUS, TIP_BALL_CENTRE_Z, UPPER_BALL_CENTRE_Z = 0.012, 0.188, 0.158
+PEG_RADIUS_M, TIP_BALL_CENTRE_Z_S_M, UPPER_BALL_CENTRE_Z_S_M = 0.012, 0.188, 0.158
 #: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
-SLOT_LENGTH, _SIDE_WIDTH = 0.10, 0.04
+SLOT_LENGTH_M, _SIDE_WIDTH_M = 0.10, 0.04
 _FLOOR_THICKNESS_M = 0.02
 _SLOT_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
 _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
@@ -61,7 +61,7 @@ class Slot(Environment):
     @property
     def width(self) -> float:
         """Distance between the walls [m]."""
-        return 2 * PEG_RADIUS + self.clearance
+        return 2 * PEG_RADIUS_M + self.clearance
 
     @property
     def slip(self) -> float:
@@ -86,8 +86,9 @@ class Slot(Environment):
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
             return
-        tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z])
-        ball, properties = Sphere(PEG_RADIUS), _contact_material(self)
+        tool = plant.GetBodyByName("tool")
+        above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
+        ball, properties = Sphere(PEG_RADIUS_M), _contact_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
         plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
         for name, (X_MBox, box) in _boxes_of_slot(self).items():
@@ -113,9 +114,9 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
             """Return a box on one side of the slot, from y `inner` outwards and z `top` down."""
-            across, height = edge + c + _SIDE_WIDTH - inner, depth + top
+            across, height = edge + c + _SIDE_WIDTH_M - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
-            return middle, Box(SLOT_LENGTH, across, height)
+            return middle, Box(SLOT_LENGTH_M, across, height)
 
         # The upper face of this box is the chamfer; its thickness fills the gap of wall and top.
         tilt, thick = RotationMatrix.MakeXRotation(side * np.pi / 4), c / np.sqrt(2)
@@ -123,8 +124,8 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
         into = RigidTransform(tilt, face - tilt.matrix()[:, 2] * thick / 2)
         boxes[f"{name}_wall"] = block(edge, -c)
         boxes[f"{name}_top"] = block(edge + c, 0.0)
-        boxes[f"{name}_chamfer"] = into, Box(SLOT_LENGTH, c * np.sqrt(2), thick)
-    across = slot.width + 2 * (c + _SIDE_WIDTH)
+        boxes[f"{name}_chamfer"] = into, Box(SLOT_LENGTH_M, c * np.sqrt(2), thick)
+    across = slot.width + 2 * (c + _SIDE_WIDTH_M)
     below = RigidTransform([0.0, 0.0, -depth - _FLOOR_THICKNESS_M / 2])
-    boxes["floor"] = below, Box(SLOT_LENGTH, across, _FLOOR_THICKNESS_M)
+    boxes["floor"] = below, Box(SLOT_LENGTH_M, across, _FLOOR_THICKNESS_M)
     return boxes

@@ -24,7 +24,7 @@ from drake_teleop.station.environment.environment import (
 
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
 _WALL_THICKNESS_M = 0.1  # m; deep enough that a tool leaves through the face
-_FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
+_FOOT_RADIUS_M, _TABLE_THICKNESS_M = 0.002, 0.05  # m: radius of the balls, thickness of the table
 _BLOCK_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 
@@ -155,13 +155,13 @@ class Block(Surface):
     def floor_stand(self) -> FloorStand | None:
         x, y, top = self.position
         across = 0.6 * min(self.table)
-        return FloorStand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
+        return FloorStand(across, across, x, y, top - _TABLE_THICKNESS_M) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         if min(self.table) > 0.0:
-            below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS / 2]
+            below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS_M / 2]
             AddFixedBox(
-                plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS], self
+                plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS_M], self
             )
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
         body = plant.AddRigidBody(_BLOCK_NAME, NewInstance(plant, _BLOCK_NAME), inertia)
@@ -175,8 +175,8 @@ class Block(Surface):
         plant.RegisterCollisionGeometry(body, here, box, _BLOCK_NAME, self.material())
         plant.RegisterVisualGeometry(body, here, box, _BLOCK_NAME, _BLOCK_COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
-            place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS))
-            ball = Sphere(_FOOT_RADIUS)
+            place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS_M))
+            ball = Sphere(_FOOT_RADIUS_M)
             plant.RegisterCollisionGeometry(
                 body, place, ball, f"{_FOOT_NAME_PREFIX}{k}", self.material()
             )

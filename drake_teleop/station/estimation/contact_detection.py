@@ -24,7 +24,7 @@ from drake_teleop.load.regressor import (
     SATURATION_FLAG_INDEX,
     sample_size,
 )
-from drake_teleop.station.slave.arm import ArmModel, acceleration_into
+from drake_teleop.station.slave.arm import ArmModel, sensor_acceleration_into
 
 
 @settings
@@ -52,7 +52,7 @@ class ContactDetectionConfig:
 @njit(cache=True)
 def _update_flag_with_arm(memory, sample, estimate, arm, settings):
     acceleration = np.empty(3)
-    acceleration_into(
+    sensor_acceleration_into(
         arm,
         sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX],
         sample[SAMPLE_SPECIFIC_FORCE],

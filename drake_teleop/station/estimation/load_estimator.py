@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.online.watched import (
@@ -93,12 +94,12 @@ class LoadEstimator(LeafSystem):
     def __init__(
         self,
         config: LoadEstimatorConfig,
-        noise_std: NDArray[np.float64],
-        motion_std: NDArray[np.float64],
+        noise_std: Array,
+        motion_std: Array,
         period: float,
         sample_size: int,
-        initial: NDArray[np.float64],
-        covariance: NDArray[np.float64] | None = None,
+        initial: Array,
+        covariance: Array | None = None,
         fallback: ArrayLike | None = None,
     ) -> None:
         super().__init__()
@@ -154,8 +155,8 @@ class LoadEstimator(LeafSystem):
 
     def _update_estimate(
         self,
-        estimate: NDArray[np.float64],
-        sample: NDArray[np.float64],
+        estimate: Array,
+        sample: Array,
         discrete_state: DiscreteValues,
         time: float,
     ) -> None:

@@ -9,30 +9,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.device_parameters import (
-    COULOMB,
-    HALF_WORKSPACE,
-    HAND_INERTIA,
-    HAND_MASS,
-    INERTIA,
-    IS_IN_TASK_SPACE,
-    MASS,
-    MAX_ROTATION,
+    COULOMB_SLOTS,
+    HALF_WORKSPACE_SLOTS,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    INERTIA_SLOT,
+    IS_IN_TASK_SPACE_SLOT,
+    MASS_SLOT,
+    MAX_ROTATION_SLOTS,
     NUM_DEVICE_PARAMETERS,
-    PEAK_FORCE,
-    PEAK_TORQUE,
-    VISCOUS,
-    WORKSPACE_CENTRE,
+    PEAK_FORCE_SLOT,
+    PEAK_TORQUE_SLOTS,
+    VISCOUS_SLOTS,
+    WORKSPACE_CENTRE_SLOTS,
 )
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
-from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
+from drake_teleop.station.master.phantom import PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
 
@@ -92,7 +92,7 @@ class DeviceFigures:
     )
 
 
-_FREE_ROTATION, _NO_ROTATION = DeviceFigures().turn, [0.0, 0.0, 0.0]
+_WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
 _OMEGA_SIZE_M = [0.11, 0.113, 0.113]
 _OMEGA_ANGLES_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
 _ENCODER_STEP_RAD = math.radians(0.09)
@@ -105,13 +105,13 @@ _ENCODER_STEP_RAD = math.radians(0.09)
 # Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
-    "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_ROTATION, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_TURN_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
     "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
     "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
-    "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_ROTATION, 6.35e-5, 0.0, 1000.0),
-    "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_ROTATION, 2e-5, 2e-3, 4000.0),
-    "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_ROTATION, 2e-5, 2e-4, 1000.0),
+    "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
+    "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
+    "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
 _DATA_SHEET_FIELDS = (
     *("apparent_mass", "friction", "peak_force", "size"),
@@ -152,24 +152,25 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
-        numbers = np.zeros(NUM_DEVICE_PARAMETERS)
-        numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
+        parameters = np.zeros(NUM_DEVICE_PARAMETERS)
+        parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            numbers[COULOMB], numbers[VISCOUS] = self.friction.coulomb, self.friction.viscous
-            numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = FORCE_LIMIT, WRIST_TORQUE_LIMIT
-            return HapticDevice(numbers, self.model)
+            parameters[COULOMB_SLOTS] = self.friction.coulomb
+            parameters[VISCOUS_SLOTS] = self.friction.viscous
+            parameters[PEAK_FORCE_SLOT] = PEAK_FORCE_N
+            parameters[PEAK_TORQUE_SLOTS] = PEAK_WRIST_TORQUES_N_M
+            return HapticDevice(parameters, self.model)
         figures = self._data_sheet()
-        numbers[IS_IN_TASK_SPACE] = 1.0
-        numbers[COULOMB] = np.repeat([figures.friction, figures.friction_torque], 3)
-        numbers[VISCOUS] = np.repeat([figures.damping, figures.turning_damping], 3)
-        numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = figures.peak_force, figures.peak_torque
-        numbers[MASS], numbers[INERTIA] = figures.apparent_mass, figures.inertia
-        numbers[WORKSPACE_CENTRE], numbers[HALF_WORKSPACE] = (
-            figures.centre,
-            0.5 * np.array(figures.size),
-        )
-        numbers[MAX_ROTATION] = figures.turn
-        return HapticDevice(numbers, self.model)
+        parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
+        parameters[COULOMB_SLOTS] = np.repeat([figures.friction, figures.friction_torque], 3)
+        parameters[VISCOUS_SLOTS] = np.repeat([figures.damping, figures.turning_damping], 3)
+        parameters[PEAK_FORCE_SLOT] = figures.peak_force
+        parameters[PEAK_TORQUE_SLOTS] = figures.peak_torque
+        parameters[MASS_SLOT], parameters[INERTIA_SLOT] = figures.apparent_mass, figures.inertia
+        parameters[WORKSPACE_CENTRE_SLOTS] = figures.centre
+        parameters[HALF_WORKSPACE_SLOTS] = 0.5 * np.array(figures.size)
+        parameters[MAX_ROTATION_SLOTS] = figures.turn
+        return HapticDevice(parameters, self.model)
 
     @property
     def is_joint_leader(self) -> bool:
@@ -184,7 +185,7 @@ class Master:
                 remedy="set it to pose: the rendered force is the same",
             )
 
-    def encoder_steps(self) -> NDArray[np.float64]:
+    def encoder_steps(self) -> Array:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
         if self.model in (PHANTOM_NAME, LEADER_NAME):
             return np.zeros(6)
@@ -260,5 +261,5 @@ class Master:
 _MAX_PITCH_RAD = 1.5  # rad
 
 
-def data_sheet_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
+def data_sheet_of_block(block: Mapping[str, Any] | None) -> DeviceFigures | None:
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

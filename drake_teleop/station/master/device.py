@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_device, twist_into
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
@@ -29,9 +29,7 @@ def _advance_device(device, work, stages, state, pose, twist, display, hand_wren
     copy_into(display, 0, state, 0, 6)
 
 
-def check_period(
-    device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
-) -> None:
+def check_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
@@ -72,9 +70,9 @@ class MasterDevice(DeviceBlock):
 
     __slots__ = ()
 
-    def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
+    def __init__(self, period: float, device: HapticDevice, q_initial: Array) -> None:
         check_period(device, q_initial, period)
-        constants = device.numbers, np.zeros((2, 6, 6)), np.zeros((3, 12))
+        constants = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
         super().__init__(period, device, q_initial, _advance_device, constants)
 
 
@@ -82,7 +80,7 @@ def AddHapticDevice(
     builder: DiagramBuilder,
     period: float,
     device: HapticDevice | LeaderDevice,
-    q_initial: NDArray[np.float64],
+    q_initial: Array,
 ) -> tuple[LeafSystem, LeafSystem]:
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):

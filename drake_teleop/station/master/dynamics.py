@@ -8,23 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
 from drake_teleop.station.master.device_parameters import (
-    COULOMB,
-    HAND_INERTIA,
-    HAND_MASS,
-    IS_IN_TASK_SPACE,
-    PEAK_FORCE,
-    PEAK_TORQUE,
-    VISCOUS,
+    COULOMB_SLOTS,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    IS_IN_TASK_SPACE_SLOT,
+    PEAK_FORCE_SLOT,
+    PEAK_TORQUE_SLOTS,
+    VISCOUS_SLOTS,
 )
 
 
 @njit(cache=True)
 def jacobian_into(q, device, J):
     """Write the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B, into J."""
-    if device[IS_IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
         task_space.jacobian_into(q, J)
     else:
         phantom.jacobian_into(q, J)
@@ -33,7 +34,7 @@ def jacobian_into(q, device, J):
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
     """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
-    if device[IS_IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
         out[:6] = 0.0
     else:
         phantom.gravity_torque_into(q, out)
@@ -42,7 +43,7 @@ def gravity_torque_into(q, device, out):
 @njit(cache=True)
 def pose_into(q, device, pose):
     """Write the stylus pose X_BE (7,) at the joint positions q (6,) into `pose`."""
-    if device[IS_IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
         task_space.pose_into(q, pose)
     else:
         phantom.pose_into(q, pose)
@@ -70,12 +71,12 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     total[:] = 0.0
     for i in range(4):
         copy_into(slope, 0, stage, 6, 6)
-        if device[IS_IN_TASK_SPACE] != 0.0:
-            task_space.acceleration_into(
+        if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
+            task_space.joint_acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
             )
         else:
-            phantom.acceleration_into(
+            phantom.joint_acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
             )
         weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
@@ -87,30 +88,30 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
         state[k] += period * total[k]
 
 
-class DisplayDevice:
-    """Base class of haptic devices; `numbers` are the parameters of `device_parameters`."""
+class HapticDeviceBase:
+    """Base class of haptic devices; `parameters` are the parameters of `device_parameters`."""
 
-    numbers: NDArray[np.float64]
+    parameters: Array
 
     @property
     def peak_force(self) -> float:
         """Largest displayed force [N]; some postures of a leader arm allow less."""
-        return float(self.numbers[PEAK_FORCE])
+        return float(self.parameters[PEAK_FORCE_SLOT])
 
     @property
-    def peak_torque(self) -> NDArray[np.float64]:
+    def peak_torque(self) -> Array:
         """Largest displayed torques (3,) about the rotational axes [N m]."""
-        return self.numbers[PEAK_TORQUE]
+        return self.parameters[PEAK_TORQUE_SLOTS]
 
 
 @dataclass(frozen=True)
-class HapticDevice(DisplayDevice):
+class HapticDevice(HapticDeviceBase):
     """Dynamics of a haptic device (Phantom or `task_space`) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """
 
-    numbers: NDArray[np.float64]
+    parameters: Array
     name: str = "phantom_premium_15"
 
     num_joints = 6
@@ -119,56 +120,57 @@ class HapticDevice(DisplayDevice):
     def friction_field(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
-    def coordinates_for_display(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coordinates_for_display(self, q: Array) -> Array:
         return q
 
     @property
     def is_phantom(self) -> bool:
-        return not self.numbers[IS_IN_TASK_SPACE]
+        return not self.parameters[IS_IN_TASK_SPACE_SLOT]
 
-    def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inverse_kinematics(self, pose: Array) -> Array:
         """Return the joint positions (6,) for a stylus pose X_BE (7,)."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
-        return task_space.inverse_kinematics(pose, self.numbers)
+        return task_space.inverse_kinematics(pose, self.parameters)
 
-    def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def forward_kinematics(self, q: Array) -> Array:
         """Return the stylus pose X_BE (7,) at the joint positions q (6,)."""
         pose = np.empty(7)
-        pose_into(q, self.numbers, pose)
+        pose_into(q, self.parameters, pose)
         return pose
 
-    def check_limits(self, q: NDArray[np.float64]) -> None:
+    def check_limits(self, q: Array) -> None:
         if self.is_phantom:
             phantom.check_limits(q)
         else:
-            task_space.check_limits(q, self.numbers)
+            task_space.check_limits(q, self.parameters)
 
-    def is_at_end_stop(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         """Return for each row of q (N, 6) whether an end stop is active."""
         if self.is_phantom:
             return phantom.is_at_end_stop(q)
-        return task_space.is_at_end_stop(q, self.numbers)
+        return task_space.is_at_end_stop(q, self.parameters)
 
-    def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, q: Array) -> Array:
         J = np.empty((6, 6))
-        jacobian_into(q, self.numbers, J)
+        jacobian_into(q, self.parameters, J)
         return J
 
-    def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mass_matrix(self, q: Array) -> Array:
         """Return the mass matrix (6, 6), including the hand."""
+        J, M, device = self.jacobian(q), np.empty((6, 6)), self.parameters
         if self.is_phantom:
-            return phantom.mass_matrix(q, self.numbers[HAND_MASS], self.numbers[HAND_INERTIA])
-        M = np.empty((6, 6))
-        task_space.mass_matrix_into(q, self.jacobian(q), self.numbers, M)
+            phantom.mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
+        else:
+            task_space.mass_matrix_into(q, J, device, M)
         return M
 
-    def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
+    def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
         """Return the damping matrix D (6, 6): the joint forces are -D dq/dt.
 
         With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
-            slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED
-            return np.diag(slope + self.numbers[VISCOUS])
-        return task_space.damping_matrix(q, self.numbers, creeping)
+            slope = creeping * self.parameters[COULOMB_SLOTS] / phantom.FRICTION_SPEED_RAD_S
+            return np.diag(slope + self.parameters[VISCOUS_SLOTS])
+        return task_space.damping_matrix(q, self.parameters, creeping)

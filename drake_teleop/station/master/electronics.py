@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 
 @njit(cache=True)
-def read_pose_into(q, q_start, steps, device, pose):
+def encoder_pose_into(q, q_start, steps, device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
     `steps` (6,) are in m or rad; 0 disables rounding.
@@ -40,18 +40,16 @@ class Encoders(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(
-        self, device: HapticDevice, q_start: NDArray[np.float64], steps: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, device: HapticDevice, q_start: Array, steps: Array) -> None:
         super().__init__()
-        self._constants = q_start, steps, device.numbers
+        self._constants = q_start, steps, device.parameters
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
         self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)
 
     def _calc_rounded_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
-        read_pose_into(q, *self._constants, output.get_mutable_value())
+        encoder_pose_into(q, *self._constants, output.get_mutable_value())
 
 
 class SampleHold(LeafSystem):
@@ -68,7 +66,7 @@ class SampleHold(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, start: NDArray[np.float64]) -> None:
+    def __init__(self, period: float, start: Array) -> None:
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))

@@ -7,14 +7,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.master.device_parameters import PEAK_FORCE, PEAK_TORQUE
-from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
+from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
+from drake_teleop.station.master.dynamics import (
+    HapticDeviceBase,
+    gravity_torque_into,
+    jacobian_into,
+)
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.passivity.safe_state import (
@@ -29,31 +33,30 @@ from drake_teleop.station.passivity.safe_state import (
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
 _layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
-_POSITIONS, _LAST_POSITIONS, DISPLAYED = _layout.vector(6), _layout.vector(6), _layout.vector(6)
-_FAULT, _IS_WRENCH_REDUCED, _TIME_SINCE_FAULT = _layout.number(), _layout.number(), _layout.number()
-_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
-_DISPLAYED_WRENCH_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
+_POSITIONS_SLOTS, _LAST_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
+DISPLAYED_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
+_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
+_MONITOR_SLOTS = _layout.vector(MASTER_MONITOR_SIZE)
+_DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
 
 
 @njit(cache=True)
-def _peak_wrench_of_device(numbers):
-    return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+def _peak_wrench_of_device(parameters):
+    return np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
 
 
-def initial_display_state(
-    q: NDArray[np.float64], numbers: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    display = np.zeros(_SILENCE_MONITOR.stop)
-    display[_POSITIONS] = display[_LAST_POSITIONS] = q
-    display[_SILENCE_MONITOR] = initial_master_monitor(_peak_wrench_of_device(numbers))
+def initial_display_state(q: Array, parameters: Array) -> Array:
+    display = np.zeros(_MONITOR_SLOTS.stop)
+    display[_POSITIONS_SLOTS] = display[_LAST_POSITIONS_SLOTS] = q
+    display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
     return display
 
 
 @njit(cache=True)
-def limit_wrench_into(wrench, numbers, J, displayed):
+def limit_wrench_into(wrench, parameters, J, displayed):
     """Write `wrench` (6,) [f; tau] at E, in B, reduced to the device's limits, into `displayed`."""
     for k in range(6):
         if not math.isfinite(wrench[k]):
@@ -61,10 +64,10 @@ def limit_wrench_into(wrench, numbers, J, displayed):
             return
     # hypot does not overflow.
     force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
-    scale = 1.0 if force <= numbers[PEAK_FORCE] else numbers[PEAK_FORCE] / force
+    scale = 1.0 if force <= parameters[PEAK_FORCE_SLOT] else parameters[PEAK_FORCE_SLOT] / force
     for k in range(3):
         displayed[k] = scale * wrench[k]
-    scale, peak = 1.0, numbers[PEAK_TORQUE]
+    scale, peak = 1.0, parameters[PEAK_TORQUE_SLOTS]
     for i in range(3):
         motor = abs(J[3, 3 + i] * wrench[3] + J[4, 3 + i] * wrench[4] + J[5, 3 + i] * wrench[5])
         if motor * scale > peak[i]:
@@ -74,54 +77,54 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 
 @njit(cache=True)
-def motor_torque_into(displayed, q, numbers, J, torque):
+def motor_torque_into(displayed, q, parameters, J, torque):
     """Write motor torques (6,), J^T `displayed` plus gravity compensation at q, into `torque`."""
-    gravity_torque_into(q, numbers, torque)
+    gravity_torque_into(q, parameters, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
 
 
 @njit(cache=True, borrows=True)
-def step_display(wrench, device, numbers, period, J, drive):
+def step_display(wrench, device, parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
     `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
-    q, fault = device[_POSITIONS], _NO_FAULT
-    copy_into(drive, 6, device, 6, _SILENCE_MONITOR.stop - 6)
+    q, fault = device[_POSITIONS_SLOTS], _NO_FAULT
+    copy_into(drive, 6, device, 6, _MONITOR_SLOTS.stop - 6)
     if all_in_range(q):
-        copy_into(drive, _LAST_POSITIONS.start, q, 0, 6)
+        copy_into(drive, _LAST_POSITIONS_SLOTS.start, q, 0, 6)
     else:
-        q, fault = device[_LAST_POSITIONS], _HAND_FAULT
+        q, fault = device[_LAST_POSITIONS_SLOTS], _HAND_FAULT
     if not all_in_range(wrench):
         fault = _WRENCH_FAULT
-    displayed, drive[_FAULT] = drive[DISPLAYED], fault
-    jacobian_into(q, numbers, J)
-    limit_wrench_into(wrench, numbers, J, displayed)
-    if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED] != 0.0:
-        _fade_wrench_after_fault(device, numbers, period, drive)
-    motor_torque_into(displayed, q, numbers, J, drive[:6])
+    displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_SLOTS], fault
+    jacobian_into(q, parameters, J)
+    limit_wrench_into(wrench, parameters, J, displayed)
+    if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED_SLOT] != 0.0:
+        _fade_wrench_after_fault(device, parameters, period, drive)
+    motor_torque_into(displayed, q, parameters, J, drive[:6])
 
 
 @njit(cache=True)
-def _fade_wrench_after_fault(device, numbers, period, drive):
-    displayed, last = drive[DISPLAYED], device[DISPLAYED]
-    limits, full = np.empty(2), _peak_wrench_of_device(numbers)
-    fault = drive[_FAULT] != _NO_FAULT
-    drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
+def _fade_wrench_after_fault(device, parameters, period, drive):
+    displayed, last = drive[DISPLAYED_SLOTS], device[DISPLAYED_SLOTS]
+    limits, full = np.empty(2), _peak_wrench_of_device(parameters)
+    fault = drive[_FAULT_SLOT] != _NO_FAULT
+    drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
     # Complete within STOP_TIME_S, so that the direction does not jump either.
-    share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_TIME_SINCE_FAULT], period)
+    share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_FAULT_AGE_SLOT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_SILENCE_MONITOR], limits)
-    drive[_IS_WRENCH_REDUCED] = 0.0
+    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_MONITOR_SLOTS], limits)
+    drive[_IS_WRENCH_REDUCED_SLOT] = 0.0
     for g in range(2):
         limit_group(displayed, g, limits[g])
         if limits[g] < full[g]:
-            drive[_IS_WRENCH_REDUCED] = 1.0
+            drive[_IS_WRENCH_REDUCED_SLOT] = 1.0
     if not fault:
-        drive[_FAULT] = _RESUMING_FAULT
+        drive[_FAULT_SLOT] = _RESUMING_FAULT
 
 
 class DeviceBlock(LeafSystem):
@@ -136,7 +139,7 @@ class DeviceBlock(LeafSystem):
         self,
         period: float,
         device: Any,
-        q_initial: NDArray[np.float64],
+        q_initial: Array,
         advance: Callable[..., None],
         constants: tuple[Any, ...],
     ) -> None:
@@ -144,7 +147,9 @@ class DeviceBlock(LeafSystem):
         self._advance, self._constants, self._period = advance, constants, period
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
-        display = initial_display_state(device.coordinates_for_display(q_initial), device.numbers)
+        display = initial_display_state(
+            device.coordinates_for_display(q_initial), device.parameters
+        )
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
         for name, start in (
@@ -189,16 +194,16 @@ class ForceDisplay(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: DisplayDevice) -> None:
+    def __init__(self, period: float, device: HapticDeviceBase) -> None:
         super().__init__()
         self._period = period
-        self._numbers = device.numbers
+        self._parameters = device.parameters
         self._jacobian = np.zeros((6, 6))
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self._device = self.DeclareVectorInputPort("for_display", _SILENCE_MONITOR.stop)
+        self._device = self.DeclareVectorInputPort("for_display", _MONITOR_SLOTS.stop)
         inputs = {self.all_input_ports_ticket()}
         self._drive = self.DeclareVectorOutputPort(
-            "drive", _SILENCE_MONITOR.stop, weak_callback(self._calc_drive), inputs
+            "drive", _MONITOR_SLOTS.stop, weak_callback(self._calc_drive), inputs
         )
         # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (
@@ -208,21 +213,25 @@ class ForceDisplay(LeafSystem):
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
+    def _wrench_to_display(self, context: Context) -> Array:
+        wrench: Array = self._command.Eval(context)
+        return wrench
+
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         step_display(
-            self._command.Eval(context),
+            self._wrench_to_display(context),
             self._device.Eval(context),
-            self._numbers,
+            self._parameters,
             self._period,
             self._jacobian,
             output.get_mutable_value(),
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[DISPLAYED])
+        output.SetFromVector(self._drive.Eval(context)[DISPLAYED_SLOTS])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._drive.Eval(context)[_FAULT]
+        output[0] = self._drive.Eval(context)[_FAULT_SLOT]
 
     def _calc_force_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_WRENCH_AND_FAULT])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT_SLOTS])

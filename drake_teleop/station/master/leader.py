@@ -10,18 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
 from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
-from drake_teleop.station.master.device_parameters import HAND_MASS
-from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
+from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT, end_stop_force
+from drake_teleop.station.master.dynamics import HapticDeviceBase
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
-    GRAVITY_COLUMN,
+    LAST_ROW_GRAVITY_COLUMN,
     ArmModel,
     forward_dynamics,
     forward_kinematics,
@@ -33,27 +34,25 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 
-Array = NDArray[np.float64]
-
-# Rows of `LeaderDevice.joints`.
+# Rows of `LeaderDevice.joint_table`.
 (
-    _COULOMB,
-    _VISCOUS,
-    _LOWER,
-    _UPPER,
-    _STOP_STIFFNESS,
-    _STOP_DAMPING,
-    _TORQUE_LIMIT,
-    _WEIGHT_SHARE,
+    _COULOMB_ROW,
+    _VISCOUS_ROW,
+    _LOWER_ROW,
+    _UPPER_ROW,
+    _STOP_STIFFNESS_ROW,
+    _STOP_DAMPING_ROW,
+    _TORQUE_LIMIT_ROW,
+    _WEIGHT_SHARE_ROW,
 ) = range(8)
-# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower joint creeps.
-FRICTION_SPEED = 0.02  # rad/s or m/s, estimate
+# Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED): a slower joint creeps.
+FRICTION_TANH_SPEED = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
 _END_STOP_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
-def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
+def leader_acceleration(arm, joint_table, q, v, applied, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
     `applied` (6,) is the hand's wrench minus the hand's weight, [f; tau] on E, in B.
@@ -66,14 +65,10 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
     for i in range(3):
         wrench[3 + i] += moment[i]
     for i in range(n):
-        tau[i] = motor[i] - joints[_COULOMB, i] * math.tanh(v[i] / FRICTION_SPEED)
-        tau[i] -= joints[_VISCOUS, i] * v[i]
-        over, under = q[i] - joints[_UPPER, i], q[i] - joints[_LOWER, i]
-        damping = joints[_STOP_DAMPING, i] * v[i]
-        if over > 0.0:
-            tau[i] += min(0.0, -joints[_STOP_STIFFNESS, i] * over - damping)
-        elif under < 0.0:
-            tau[i] += max(0.0, -joints[_STOP_STIFFNESS, i] * under - damping)
+        tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(v[i] / FRICTION_TANH_SPEED)
+        tau[i] -= joint_table[_VISCOUS_ROW, i] * v[i]
+        lower, upper, stiffness, damping = joint_table[_LOWER_ROW : _STOP_DAMPING_ROW + 1, i]
+        tau[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
     forward_dynamics(arm, q, v, tau, wrench, vdot)
 
 
@@ -97,33 +92,34 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
 
 
 @njit(cache=True)
-def motor_torques_into(bare, arm, joints, q, F, torque):
+def motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
-    F (6,) is the wrench at E; `bare` is `ArmModel.table` without the hand.
+    F (6,) is the wrench at E; `arm_without_hand` is `ArmModel.table` without the hand.
     """
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
-    inverse_dynamics(bare, q, still, still, torque)
+    inverse_dynamics(arm_without_hand, q, still, still, torque)
     jacobian(arm, q, J)
     for i in range(n):
-        torque[i] *= joints[_WEIGHT_SHARE, i]
+        torque[i] *= joint_table[_WEIGHT_SHARE_ROW, i]
         for k in range(6):
             torque[i] += J[k, i] * F[k]
-        limit = joints[_TORQUE_LIMIT, i]
+        limit = joint_table[_TORQUE_LIMIT_ROW, i]
         torque[i] = min(max(torque[i], -limit), limit)
 
 
 @njit(cache=True)
 def step_leader(
-    bare, arm, joints, hand_weight, state, pose, twist, display, hand_wrench, drive, period
+    arm_without_hand, arm, joint_table, hand_weight, state, pose, twist, display,
+    hand_wrench, drive, period,
 ):  # fmt: skip
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `bare` and `arm` are `ArmModel.table` without and with the hand, whose weight `hand_weight` [N]
-    the operator carries.
+    `arm_without_hand` and `arm` are `ArmModel.table`. The operator carries the hand's weight
+    `hand_weight` [N].
     """
-    n = joints.shape[1]
+    n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
     if all_in_range(hand_wrench) and all_in_range(drive[:6]) and all_in_range(state):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
@@ -131,16 +127,16 @@ def step_leader(
             F[i], F[3 + i] = drive[i], drive[5 - i]
         copy_into(applied, 0, hand_wrench, 0, 6)
         # The arm's own gravity vector may have any direction.
-        g = arm[n, GRAVITY_COLUMN : GRAVITY_COLUMN + 3]
+        g = arm[n, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
-        motor_torques_into(bare, arm, joints, state[:n], F, motor)
+        motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
-            leader_acceleration(arm, joints, stage[:n], stage[n:], applied, motor, slope[n:])
+            leader_acceleration(arm, joint_table, stage[:n], stage[n:], applied, motor, slope[n:])
             weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
             ahead = 1.0 if i == 2 else 0.5
             for k in range(2 * n):
@@ -154,16 +150,16 @@ def step_leader(
 
 
 @njit(cache=True)
-def _limit_wrench_to_motors(bare, arm, joints, q, wrench, shortened):
+def _limit_wrench_to_motors(arm_without_hand, arm, joint_table, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
-    motor_torques_into(bare, arm, joints, q, np.zeros(6), weight)
+    motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
     jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
         for k in range(6):
             torque += J[k, i] * wrench[k]
-        room = joints[_TORQUE_LIMIT, i] - (weight[i] if torque > 0.0 else -weight[i])
+        room = joint_table[_TORQUE_LIMIT_ROW, i] - (weight[i] if torque > 0.0 else -weight[i])
         if abs(torque) * share > room:
             share = max(room, 0.0) / abs(torque)
     for k in range(6):
@@ -171,24 +167,24 @@ def _limit_wrench_to_motors(bare, arm, joints, q, wrench, shortened):
 
 
 @dataclass(frozen=True)
-class LeaderDevice(DisplayDevice):
+class LeaderDevice(HapticDeviceBase):
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
         arm: dynamics of the chain from B to E, with the hand's mass.
-        bare: dynamics without the hand, for weight compensation.
-        joints: (8, n) Coulomb friction [N m], damping in addition to the model's [N m s/rad], lower
-            and upper limits [rad], stiffness and damping of the end stops, torque limits [N m],
+        arm_without_hand: dynamics without the hand, for weight compensation.
+        joint_table: (8, n) Coulomb friction [N m], damping in addition to the model's [N m s/rad],
+            lower and upper limits [rad], stiffness and damping of end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        numbers: (NUM_DEVICE_PARAMETERS,) parameters for the force display.
+        parameters: (NUM_DEVICE_PARAMETERS,) parameters for the force display.
     """
 
     arm: ArmModel
-    bare: ArmModel
-    joints: Array
+    arm_without_hand: ArmModel
+    joint_table: Array
     home: Array
-    numbers: Array
+    parameters: Array
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
@@ -200,7 +196,7 @@ class LeaderDevice(DisplayDevice):
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        return self.bare.table, self.arm.table, self.joints
+        return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_display(self, q: Array) -> Array:
         """Return the vector (6,) for the force display: position of E (3) [m], three zeros."""
@@ -226,16 +222,17 @@ class LeaderDevice(DisplayDevice):
         return pose
 
     def check_limits(self, q: Array) -> None:
-        for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
+        lower, upper = self.joint_table[[_LOWER_ROW, _UPPER_ROW]]
+        for k in np.flatnonzero((q < lower) | (q > upper)):
             raise DrakeTeleopError(
                 f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
-                f" {self.joints[_LOWER, k]:.3g} and {self.joints[_UPPER, k]:.3g} (rad or m)",
+                f" {lower[k]:.3g} and {upper[k]:.3g} (rad or m)",
                 where="master.leader.home",
                 remedy="start within the limits of its joints",
             )
 
     def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
-        return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
+        return ((q < self.joint_table[_LOWER_ROW]) | (q > self.joint_table[_UPPER_ROW])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, self.num_joints))
@@ -246,14 +243,14 @@ class LeaderDevice(DisplayDevice):
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING_COLUMN]
-        return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
+        own = self.joint_table[_VISCOUS_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
+        return np.diag(own + creeping * self.joint_table[_COULOMB_ROW] / FRICTION_TANH_SPEED)
 
 
-def joint_parameters(
+def make_joint_table(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """Return `LeaderDevice.joints` (8, n); the end stops scale with the inertia at home.
+    """Return `LeaderDevice.joint_table` (8, n); the end stops scale with the inertia at home.
 
     `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
     the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
@@ -282,13 +279,10 @@ class LeaderArm(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        constants = (*device.compiled_constants, _operator_hand_weight(device))
+        gravity = np.linalg.norm(device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN:][:3])
+        hand_weight = float(device.parameters[HAND_MASS_SLOT] * gravity)
+        constants = (*device.compiled_constants, hand_weight)
         super().__init__(period, device, q_initial, step_leader, constants)
-
-
-def _operator_hand_weight(device: LeaderDevice) -> float:
-    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3])
-    return float(device.numbers[HAND_MASS] * gravity)
 
 
 class LeaderDisplay(ForceDisplay):
@@ -316,16 +310,9 @@ class LeaderDisplay(ForceDisplay):
         self._constants, self._n = device.compiled_constants, device.num_joints
         self._shortened = np.zeros(6)
 
-    def _calc_drive(self, context: Context, output: BasicVector) -> None:
+    def _wrench_to_display(self, context: Context) -> Array:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
             _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
-            wrench = self._shortened
-        step_display(
-            wrench,
-            self._device.Eval(context),
-            self._numbers,
-            self._period,
-            self._jacobian,
-            output.get_mutable_value(),
-        )
+            return self._shortened
+        return wrench

@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.master.device_parameters import (
-    HAND_INERTIA,
-    HAND_MASS,
-    IS_IN_TASK_SPACE,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    IS_IN_TASK_SPACE_SLOT,
     NUM_DEVICE_PARAMETERS,
-    PEAK_FORCE,
-    PEAK_TORQUE,
+    PEAK_FORCE_SLOT,
+    PEAK_TORQUE_SLOTS,
 )
-from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
+from drake_teleop.station.master.leader import LeaderDevice, make_joint_table
 from drake_teleop.station.slave.arm import (
     PHI_COLUMN,
     ROTATION_COLUMN,
@@ -33,7 +33,6 @@ from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
-Array = NDArray[np.float64]
 JOINT_MODE = "joints"
 
 
@@ -117,21 +116,22 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home_positions(arm)
-        bare = _with_end_frame_E(arm, home, np.array(position))
-        phi = bare.phi_load
+        arm_without_hand = _with_end_frame_E(arm, home, np.array(position))
+        phi = arm_without_hand.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
-        held = bare.with_load(phi)
+        held = arm_without_hand.with_load(phi)
         coulomb, viscous = (
             self._values_per_joint(name, arm, 0.0) for name in ("friction", "damping")
         )
         limit = self._values_per_joint("torque_limit", arm, arm.effort_limit)
-        joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
-        numbers = np.zeros(NUM_DEVICE_PARAMETERS)
-        numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
-        numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
-        numbers[IS_IN_TASK_SPACE] = 1.0
-        return LeaderDevice(held, bare, joints, home, numbers)
+        joint_table = make_joint_table(held, home, coulomb, viscous, limit, self.weight_carried)
+        parameters = np.zeros(NUM_DEVICE_PARAMETERS)
+        parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
+        parameters[PEAK_FORCE_SLOT] = self.peak_force
+        parameters[PEAK_TORQUE_SLOTS] = self.peak_torque
+        parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
+        return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
 
     def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:

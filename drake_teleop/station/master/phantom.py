@@ -21,6 +21,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     cross,
     dot,
@@ -29,9 +30,15 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.device_parameters import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
+from drake_teleop.station.master.device_parameters import (
+    COULOMB_SLOTS,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    VISCOUS_SLOTS,
+    end_stop_force,
+)
 
-GRAVITY = 9.81  # m/s^2, along -z_B
+GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 
 L1, L2, L3, L5, L6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527  # m, P
 # Mass [kg]; moments of inertia [kg m^2] about x (the pitch axis), y and z of the source, P.
@@ -42,23 +49,23 @@ INERTIA_BE = (11.09e-4, 10.06e-4, 0.591e-4)
 INERTIA_DF = (7.11e-4, 0.629e-4, 6.246e-4)
 INERTIA_BASE_YY = 11.87e-4
 GEAR_RATIOS = (13.3, 11.2, 11.2)  # P
-MOTOR_INERTIA = 1.08e-6  # kg m^2, P
-WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at E, estimate
-WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, estimate
+MOTOR_INERTIA_KG_M2 = 1.08e-6  # kg m^2, P
+WRIST_MASS_KG = 0.15  # kg, three links, each with its centre of mass at E, estimate
+WRIST_LINK_INERTIA_KG_M2 = 5e-5  # kg m^2, each wrist link, about every axis, estimate
 
 #: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
-JOINT_LOWER = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
-JOINT_UPPER = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
+JOINT_LOWER_RAD = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
+JOINT_UPPER_RAD = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
 #: Range of q2 - q3 [rad], limited by the five-bar, P.
-FIVE_BAR_RANGE = (math.radians(-55.0), math.radians(65.0))
-FORCE_LIMIT = 37.5  # N, peak at the gimbal point, D
-WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
+FIVE_BAR_RANGE_RAD = (math.radians(-55.0), math.radians(65.0))
+PEAK_FORCE_N = 37.5  # N, peak at the gimbal point, D
+PEAK_WRIST_TORQUES_N_M = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
 
 #: Posture with R_BE = identity, in the middle of the workspace.
-HOME_POSTURE = np.zeros(6)
+HOME_POSTURE_RAD = np.zeros(6)
 
-# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED): a slower device creeps.
-FRICTION_SPEED = 0.01  # rad/s, estimate
+# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED_RAD_S): a slower device creeps.
+FRICTION_SPEED_RAD_S = 0.01  # rad/s, estimate
 # End stops: spring and damper that never pull, estimate: 7 kN/m at the tip.
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
@@ -84,9 +91,11 @@ _M11_Q3 = 0.5 * (
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
 _M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_MOTOR_1, _MOTOR_2, _MOTOR_3 = (gear**2 * MOTOR_INERTIA for gear in GEAR_RATIOS)
-_GRAVITY_TORQUE_2 = 0.5 * GRAVITY * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
-_GRAVITY_TORQUE_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+_MOTOR_INERTIA_1, _MOTOR_INERTIA_2, _MOTOR_INERTIA_3 = (
+    gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS
+)
+_GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_GRAVITY_TORQUE_3 = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 
 @njit(cache=True)
@@ -129,13 +138,13 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
-    M[0, 0] += _MOTOR_1
-    M[1, 1] += _MOTOR_2
-    M[2, 2] += _MOTOR_3
-    tip_mass = WRIST_MASS + hand_mass
+    M[0, 0] += _MOTOR_INERTIA_1
+    M[1, 1] += _MOTOR_INERTIA_2
+    M[2, 2] += _MOTOR_INERTIA_3
+    tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.
-        carried = WRIST_INERTIA * (6 - max(j, 3)) + hand_inertia
+        carried = WRIST_LINK_INERTIA_KG_M2 * (6 - max(j, 3)) + hand_inertia
         for i in range(j + 1):
             value = carried * (J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j])
             value += tip_mass * (J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j])
@@ -146,7 +155,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    weight = WRIST_MASS * GRAVITY
+    weight = WRIST_MASS_KG * GRAVITY_M_S2
     out[0] = 0.0
     out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
     out[2] = (_GRAVITY_TORQUE_3 + weight * L2) * math.sin(q[2])
@@ -167,7 +176,7 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
-    tip_mass = WRIST_MASS + hand_mass
+    tip_mass = WRIST_MASS_KG + hand_mass
     radial = -L1 * c2 * v[1] ** 2 - L2 * s3 * v[2] ** 2 - (L1 * c2 + L2 * s3) * v[0] ** 2
     tangential = 2.0 * (-L1 * s2 * v[1] + L2 * c3 * v[2]) * v[0]
     fx = tip_mass * (c1 * radial - s1 * tangential)
@@ -184,34 +193,25 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
         alpha = plus(alpha, cross(omega, turn))
         omega = plus(omega, turn)
         if k >= 3:
-            inertia = WRIST_INERTIA + (hand_inertia if k == 5 else 0.0)
+            inertia = WRIST_LINK_INERTIA_KG_M2 + (hand_inertia if k == 5 else 0.0)
             for i in range(k + 1):
                 torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
 
 
 @njit(cache=True)
-def _end_stop_torque(angle, rate, lower, upper, stiffness, damping):
-    if angle > upper:
-        return min(0.0, -stiffness * (angle - upper) - damping * rate)
-    if angle < lower:
-        return max(0.0, -stiffness * (angle - lower) - damping * rate)
-    return 0.0
-
-
-@njit(cache=True)
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
-        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED) + viscous[i] * v[i]
+        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED_RAD_S) + viscous[i] * v[i]
         stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
         damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
-        torque[i] += _end_stop_torque(
-            q[i], v[i], JOINT_LOWER[i], JOINT_UPPER[i], stiffness, damping
+        torque[i] += end_stop_force(
+            q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
         )
-    five_bar = _end_stop_torque(
+    five_bar = end_stop_force(
         q[1] - q[2],
         v[1] - v[2],
-        FIVE_BAR_RANGE[0],
-        FIVE_BAR_RANGE[1],
+        FIVE_BAR_RANGE_RAD[0],
+        FIVE_BAR_RANGE_RAD[1],
         _STOP_STIFFNESS,
         _STOP_DAMPING,
     )
@@ -220,21 +220,21 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
 
 
 @njit(cache=True)
-def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
+def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `work` is scratch.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, device[HAND_MASS], device[HAND_INERTIA], M)
+    mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
     gravity_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
-    _add_friction_and_end_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
+    _subtract_coriolis(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
+    _add_friction_and_end_stops(q, v, device[COULOMB_SLOTS], device[VISCOUS_SLOTS], vdot)
     solve_by_cholesky(M, vdot, 6)
 
 
@@ -259,33 +259,7 @@ def pose_into(q, pose):
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
 
 
-def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    J = np.empty((6, 6))
-    jacobian_into(q, J)
-    return J
-
-
-def mass_matrix(
-    q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
-) -> NDArray[np.float64]:
-    M = np.empty((6, 6))
-    mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
-    return M
-
-
-def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    torque = np.empty(6)
-    gravity_torque_into(q, torque)
-    return torque
-
-
-def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    pose = np.empty(7)
-    pose_into(q, pose)
-    return pose
-
-
-def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_kinematics(pose: Array) -> Array:
     """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees."""
     x, y, z = pose[4:7]
     reach = math.hypot(x, y)
@@ -309,30 +283,30 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return q
 
 
-def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def serial_joint_angles(q: Array) -> Array:
     """Return the joint angles of `phantom.sdf` for q (..., 6): its third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
 
 
-def is_at_end_stop(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_at_end_stop(q: Array) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
-    beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
-    return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
+    beyond = ((q < JOINT_LOWER_RAD) | (q > JOINT_UPPER_RAD)).any(axis=1)
+    return beyond | (folded < FIVE_BAR_RANGE_RAD[0]) | (folded > FIVE_BAR_RANGE_RAD[1])
 
 
-def check_limits(q: NDArray[np.float64]) -> None:
+def check_limits(q: Array) -> None:
     margin = 1e-9
     for i in range(6):
-        if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:
+        if not JOINT_LOWER_RAD[i] - margin <= q[i] <= JOINT_UPPER_RAD[i] + margin:
             raise DrakeTeleopError(
                 f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
-                f"{np.degrees(JOINT_LOWER[i]):.1f} to {np.degrees(JOINT_UPPER[i]):.1f}",
+                f"{np.degrees(JOINT_LOWER_RAD[i]):.1f} to {np.degrees(JOINT_UPPER_RAD[i]):.1f}",
                 where="pose_master",
                 remedy="choose a start pose inside the device's workspace",
             )
-    if not FIVE_BAR_RANGE[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE[1] + margin:
+    if not FIVE_BAR_RANGE_RAD[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE_RAD[1] + margin:
         raise DrakeTeleopError(
             f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
             where="pose_master",

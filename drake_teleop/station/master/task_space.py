@@ -14,23 +14,25 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross, plus, scale_vector
 from drake_teleop.station.master.device_parameters import (
-    COULOMB,
-    HALF_WORKSPACE,
-    HAND_INERTIA,
-    HAND_MASS,
-    INERTIA,
-    MASS,
-    MAX_ROTATION,
-    VISCOUS,
-    WORKSPACE_CENTRE,
+    COULOMB_SLOTS,
+    HALF_WORKSPACE_SLOTS,
+    HAND_INERTIA_SLOT,
+    HAND_MASS_SLOT,
+    INERTIA_SLOT,
+    MASS_SLOT,
+    MAX_ROTATION_SLOTS,
+    VISCOUS_SLOTS,
+    WORKSPACE_CENTRE_SLOTS,
+    end_stop_force,
 )
 
-# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower device creeps.
-FRICTION_SPEED, FRICTION_ANGULAR_SPEED = 0.002, 0.01  # m/s, rad/s, estimate
+# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED_M_S): a slower device creeps.
+FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
 # End stops: spring and damper that never pull, estimate.
-_STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
+_STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M = 5000.0, 20.0  # N/m, N s/m
 _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
 
@@ -47,16 +49,16 @@ def jacobian_into(q, J):
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
     M[:, :] = 0.0
-    inertia = device[INERTIA] + device[HAND_INERTIA]
+    inertia = device[INERTIA_SLOT] + device[HAND_INERTIA_SLOT]
     for i in range(3):
-        M[i, i] = device[MASS] + device[HAND_MASS]
+        M[i, i] = device[MASS_SLOT] + device[HAND_MASS_SLOT]
         for k in range(3):
             for row in range(3, 6):
                 M[3 + i, 3 + k] += inertia * J[row, 3 + i] * J[row, 3 + k]
 
 
 @njit(cache=True)
-def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
+def _drag_coefficient(motion, coulomb, viscous, speed_of_tanh):
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / speed_of_tanh
@@ -64,48 +66,37 @@ def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
 
 
 @njit(cache=True)
-def _end_stop_force(beyond, rate, stiffness, damping):
-    if beyond > 0.0:
-        return min(0.0, -stiffness * beyond - damping * rate)
-    if beyond < 0.0:
-        return max(0.0, -stiffness * beyond - damping * rate)
-    return 0.0
-
-
-@njit(cache=True)
-def _penetration_into_end_stop(x, half):
-    return x - half if x > half else (x + half if x < -half else 0.0)
-
-
-@njit(cache=True)
-def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
+def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
-    mass = device[MASS] + device[HAND_MASS]
-    drag = _friction_factor(v[:3], device[COULOMB.start], device[VISCOUS.start], FRICTION_SPEED)
+    mass = device[MASS_SLOT] + device[HAND_MASS_SLOT]
+    drag = _drag_coefficient(
+        v[:3], device[COULOMB_SLOTS.start], device[VISCOUS_SLOTS.start], FRICTION_SPEED_M_S
+    )
     for i in range(3):
-        beyond = _penetration_into_end_stop(
-            q[i] - device[WORKSPACE_CENTRE][i], device[HALF_WORKSPACE][i]
-        )
-        stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        x, half = q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
+        stop = end_stop_force(x, v[i], -half, half, _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
-    inertia = device[INERTIA] + device[HAND_INERTIA]
+    inertia = device[INERTIA_SLOT] + device[HAND_INERTIA_SLOT]
     omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
     for k in range(4, 6):
         turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _friction_factor(
-        omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], FRICTION_ANGULAR_SPEED
+    drag = _drag_coefficient(
+        omega,
+        device[COULOMB_SLOTS.start + 3],
+        device[VISCOUS_SLOTS.start + 3],
+        FRICTION_SPEED_RAD_S,
     )
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
     for i in range(3):
-        beyond = _penetration_into_end_stop(q[3 + i], device[MAX_ROTATION][i])
-        torque[i] = motor[3 + i] + _end_stop_force(
-            beyond, v[3 + i], _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
+        half = device[MAX_ROTATION_SLOTS][i]
+        torque[i] = motor[3 + i] + end_stop_force(
+            q[3 + i], v[3 + i], -half, half, _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
         )
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
@@ -132,19 +123,15 @@ def pose_into(q, pose):
         pose[4 + i] = q[i]
 
 
-def damping_matrix(
-    q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
-) -> NDArray[np.float64]:
+def damping_matrix(q: Array, device: Array, creeping: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
-    of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
-    drag = device[VISCOUS][[0, 3]] + creeping * device[COULOMB][[0, 3]] / of_tanh
+    of_tanh = np.array([FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S])
+    drag = device[VISCOUS_SLOTS][[0, 3]] + creeping * device[COULOMB_SLOTS][[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
 
-def inverse_kinematics(
-    pose: NDArray[np.float64], device: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def inverse_kinematics(pose: Array, device: Array) -> Array:
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -152,27 +139,26 @@ def inverse_kinematics(
     return q
 
 
-def _outside_workspace(
-    q: NDArray[np.float64], device: NDArray[np.float64], margin: float
-) -> NDArray[np.bool_]:
-    centre = np.append(device[WORKSPACE_CENTRE], np.zeros(3))
-    return np.abs(q - centre) > np.append(device[HALF_WORKSPACE], device[MAX_ROTATION]) + margin
+def _is_outside(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
+    centre = np.append(device[WORKSPACE_CENTRE_SLOTS], np.zeros(3))
+    half = np.append(device[HALF_WORKSPACE_SLOTS], device[MAX_ROTATION_SLOTS])
+    return np.abs(q - centre) > half + margin
 
 
-def is_at_end_stop(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_at_end_stop(q: Array, device: Array) -> NDArray[np.bool_]:
     return (
-        _outside_workspace(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION] > 0.0)
+        _is_outside(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION_SLOTS] > 0.0)
     ).any(axis=1)
 
 
-def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    if _outside_workspace(q, device, 1e-9).any():
+def check_limits(q: Array, device: Array) -> None:
+    if _is_outside(q, device, 1e-9).any():
         low, high = (
-            device[WORKSPACE_CENTRE] - device[HALF_WORKSPACE],
-            device[WORKSPACE_CENTRE] + device[HALF_WORKSPACE],
+            device[WORKSPACE_CENTRE_SLOTS] - device[HALF_WORKSPACE_SLOTS],
+            device[WORKSPACE_CENTRE_SLOTS] + device[HALF_WORKSPACE_SLOTS],
         )
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
-        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION]))
+        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION_SLOTS]))
         raise DrakeTeleopError(
             f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "

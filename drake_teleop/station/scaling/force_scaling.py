@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     matrix_as_tuple,
@@ -38,7 +38,7 @@ from drake_teleop.load.regressor import (
     non_contact_wrench_into,
     sample_size,
 )
-from drake_teleop.station.slave.arm import ArmModel, acceleration_into, forward_kinematics
+from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, sensor_acceleration_into
 
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
 _CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
@@ -120,12 +120,12 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
 
 
 def wrench_to_master(
-    wrench_S: NDArray[np.float64],
-    R_WS: NDArray[np.float64],
-    R_WB: NDArray[np.float64],
+    wrench_S: Array,
+    R_WS: Array,
+    R_WB: Array,
     force_scale: float,
     torque_scale: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the wrench to render (..., 6), the scaled reaction to the sensor's wrench: F_E_B.
 
     It is [f; tau] on the hand at the grip E, in B [N, N m].
@@ -170,12 +170,14 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
         gravity = np.empty(3)
-        acceleration_into(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity)
+        sensor_acceleration_into(
+            arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity
+        )
         add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
 @njit(cache=True)
-def find_fault(sample, estimate, time, valid_range):
+def find_sample_fault(sample, estimate, time, valid_range):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
     `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
@@ -205,14 +207,14 @@ def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, ou
 def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
     _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
     _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
-    out[12] = find_fault(sample, estimate, time, valid_range)
+    out[12] = find_sample_fault(sample, estimate, time, valid_range)
 
 
 @njit(cache=True)
 def _rendered_wrench_into(
     sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out
 ):
-    if find_fault(sample, estimate, time, valid_range) != _NO_FAULT:
+    if find_sample_fault(sample, estimate, time, valid_range) != _NO_FAULT:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
@@ -257,14 +259,14 @@ class ForceScaling(LeafSystem):
         self,
         config: ForceScalingConfig,
         arm: ArmModel,
-        R_WB: NDArray[np.float64],
-        largest_wrench: NDArray[np.float64] | None = None,
+        R_WB: Array,
+        largest_wrench: Array | None = None,
         oldest: float = MAX_SAMPLE_AGE_S,
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
         self._valid_range = np.append(largest, oldest)
-        self._gripper: NDArray[np.float64] | None = None
+        self._gripper: Array | None = None
         if config.gripper_phi is not None:
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
@@ -330,7 +332,7 @@ class ForceScaling(LeafSystem):
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         sample, estimate, _, _, time = self._evaluate_inputs(context)
-        output[0] = find_fault(sample, estimate, time, self._valid_range)
+        output[0] = find_sample_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         constants = self._arm, _CONTACT_ONLY_SCALES

@@ -4,13 +4,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     copy_into,
@@ -102,9 +102,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(
-        self, config: KinematicScalingConfig, period: float, start: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, config: KinematicScalingConfig, period: float, start: Array) -> None:
         super().__init__()
         R_WB = RollPitchYaw(config.alignment).ToQuaternion().wxyz()
         self._scaling = (R_WB, float(config.translation_scale), float(config.rotation_scale))
@@ -119,7 +117,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         # The command follows from the first sample on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def OpenClutch(self, context: Context, command: NDArray[np.float64]) -> None:
+    def OpenClutch(self, context: Context, command: Array) -> None:
         """Open the clutch; the slave's commanded pose X_WS stays at `command` (7,)."""
         references = context.get_discrete_state(0).CopyToVector()
         references[:7], references[14] = command, 0.0

@@ -44,7 +44,11 @@ from drake_teleop.station.sensor.sensor_chain import (
     settle_low_pass,
     shift_delay_line,
 )
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, GRAVITY_COLUMN, sensor_motion
+from drake_teleop.station.slave.arm import (
+    LAST_ROW_GRAVITY_COLUMN,
+    SENSOR_MOTION_SIZE,
+    sensor_motion,
+)
 
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
@@ -70,7 +74,7 @@ _ANGULAR_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FUSION_FILTER_SIZE
 _KINEMATICS_SCRATCH_START = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_START = _KINEMATICS_SCRATCH_START + FRAME_STATE_SIZE
+_JOINT_START = _KINEMATICS_SCRATCH_START + SENSOR_MOTION_SIZE
 _NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
@@ -275,7 +279,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     if constants[_USE_ENCODERS_INDEX] != 0.0:
         copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        _convert_accelerometer(constants, memory, arm[n, GRAVITY_COLUMN:], motion, sample)
+        _convert_accelerometer(constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample)
     memory[0] += 1.0
 
 

@@ -70,12 +70,12 @@ from drake_teleop.station.sensor.sensor_chain import (
     read_sensor_into,
 )
 from drake_teleop.station.slave.arm import (
-    FRAME_STATE_SIZE,
+    SENSOR_MOTION_SIZE,
     ArmModel,
     forward_kinematics,
     sensor_motion,
 )
-from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
+from drake_teleop.station.slave.drake_contact import ContactPlantCopy, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
@@ -147,7 +147,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
     rigid = truth[SAMPLE_WRENCH_AND_MOTION]
-    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(FRAME_STATE_SIZE), rigid)
+    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
     copy_into(truth, TRUE_JOINT_ANGLES.start, x, 0, n)
     size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
@@ -202,7 +202,7 @@ def take_due_samples(
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
-            damping, gravity; `JointTable` of other moving bodies, wrenches from Drake).
+            damping, gravity; `MakeJointTable` of other moving bodies, wrenches from Drake).
         sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
             and of `tail`, ideal).
         time: present time [s], the end of a step.
@@ -327,22 +327,25 @@ class WristSensor(LeafSystem):
         if not config.ideal:
             first[SAMPLE_WRENCH] += config.offset
         #: Reason why contact is outside the compiled contact law, or "".
-        self.reason_beyond_contact_law = contact.beyond
+        self.reason_beyond_contact_law = contact.drake_contact_reason
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
-        self._uses_plant_contact = config.ideal or bool(contact.beyond)
+        self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
-        self._max_queued_steps = _MAX_QUEUED_STEPS if slave.can_touch and not contact.beyond else 1
-        self._around = np.zeros(2 + contact.plant_size)
+        self._max_queued_steps = (
+            _MAX_QUEUED_STEPS if slave.can_touch and not contact.drake_contact_reason else 1
+        )
+        self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         # No reference to the plant: it would be a cycle with the Diagram that owns this block.
-        self._watched, self._plant_size = contact.watched, contact.plant_size
+        self._watched, self._plant_size = contact.monitored_pairs, contact.plant_state_size
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
-        self.moving_bodies_sentence = ", ".join(contact.moving) + " can move" * bool(contact.moving)
+        moving = contact.moving_bodies
+        self.moving_bodies_sentence = ", ".join(moving) + " can move" * bool(moving)
         self._twin_arguments = slave.config, slave.environment, slave.start
-        self._twin: ContactTwin | None = None
+        self._twin: ContactPlantCopy | None = None
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
@@ -355,20 +358,20 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = self._plant = None
-        if slave.sheet_in_compiled_law is not None:
+        if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        if contact.plant_size:
-            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
+        if contact.plant_state_size:
+            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)
         if slave.can_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
-            self._tool = contact.bodies, contact.shapes
+            self._tool = contact.tool_bodies, contact.tool_shapes
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", NOISE_BLOCK_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._memory_slice = slice(len(first) + 1, None)  # memory in the output
-        self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
+        self._scratch = np.empty((9, 2 * n + 6 + contact.plant_state_size))
         # Without the acceleration: each change in the plant would invalidate twice.
         pushes = (self._torque, self._rate, self._applied)
         around = (self._sheet, self._plant, self._contacts)
@@ -474,7 +477,7 @@ class WristSensor(LeafSystem):
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
         if self._twin is None:
-            self._twin = ContactTwin(*self._twin_arguments)
+            self._twin = ContactPlantCopy(*self._twin_arguments)
         own = 2 * self._n + 2
         size = own + self._plant_size
         told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
@@ -534,7 +537,7 @@ def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
     touching = np.zeros(6)
-    motion = np.zeros(FRAME_STATE_SIZE)
+    motion = np.zeros(SENSOR_MOTION_SIZE)
     truth = sample[SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
     sample[SAMPLE_JOINT_POSITION] = q
@@ -563,10 +566,10 @@ def AddCompiledWristSensor(
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    if slave.sheet_in_compiled_law is not None:
-        sheet = slave.plant.get_state_output_port(slave.sheet_in_compiled_law)
+    if slave.compiled_sheet_instance is not None:
+        sheet = slave.plant.get_state_output_port(slave.compiled_sheet_instance)
         builder.Connect(sheet, sensor.GetInputPort("sheet_state"))
-    if slave.contact.plant_size:
+    if slave.contact.plant_state_size:
         builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
     if slave.can_touch:
         results = slave.plant.get_contact_results_output_port()

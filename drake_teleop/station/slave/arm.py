@@ -14,6 +14,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.common.vectors import (
     add_cross_product,
     add_into,
@@ -31,8 +33,6 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.slave.joint_friction import dry_friction
 
-Array = NDArray[np.float64]
-
 # Columns of ArmModel.table.
 (
     ROTATION_COLUMN,
@@ -45,9 +45,9 @@ Array = NDArray[np.float64]
 ) = 0, 9, 12, 22, 23, 24, 25
 NUM_TABLE_COLUMNS = 26
 # First of three columns with gravity, in the last row only.
-GRAVITY_COLUMN = 22
+LAST_ROW_GRAVITY_COLUMN = 22
 
-FRAME_STATE_SIZE = 21
+SENSOR_MOTION_SIZE = 21
 """Length of the vector that `sensor_motion` fills."""
 
 
@@ -96,12 +96,18 @@ class ArmModel:
 
     @property
     def phi_load(self) -> Array:
-        return self.load.copy()
+        return self.phi_load_view.copy()
 
     @property
-    def load(self) -> Array:
+    def phi_load_view(self) -> Array:
         """Inertial parameters phi (10,) of the load about So, in S; changes also change `table`."""
         return self.table[-1, PHI_COLUMN:ROTOR_COLUMN]
+
+    def pose(self, q: Array) -> Array:
+        """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self.table, q, R_WS, p_WS)
+        return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
 
     def with_load(self, phi: Array) -> ArmModel:
         table = self.table.copy()
@@ -110,7 +116,9 @@ class ArmModel:
 
 
 @njit(cache=True, inline="always")
-def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
+def _advance_pose_over_joint(
+    table: Array, row: int, q: float, x: Array
+) -> tuple[float, float, float]:
     """Replace the pose of the previous link P in the state x by that of link L; return p_PL_W."""
     joint = table[row]
     p_PL_P = vector_at(joint, TRANSLATION_COLUMN)
@@ -129,8 +137,10 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 
 @njit(cache=True, inline="always")
-def _advance_motion(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
-    r = _advance_pose(table, row, q, x)
+def _advance_motion_over_joint(
+    table: Array, row: int, q: float, qd: float, qdd: float, x: Array
+) -> None:
+    r = _advance_pose_over_joint(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
     if table[row, IS_PRISMATIC_COLUMN] != 0.0:
@@ -140,19 +150,19 @@ def _advance_motion(table: Array, row: int, q: float, qd: float, qdd: float, x: 
         add_into(x, 6, plus(scale_vector(qdd, z), scale_vector(qd, cross(omega, z))))
 
 
-def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
+def sensor_accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
     """Return accelerations s + g (N, 3) of So from specific forces s (N, 3), in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
-        acceleration_into(arm.table, q[k], s[k], out[k])
+        sensor_acceleration_into(arm.table, q[k], s[k], out[k])
     return out
 
 
 @njit(cache=True)
-def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
+def sensor_acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
-    g = table[table.shape[0] - 1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3]
+    g = table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3]
     for i in range(3):
         out[i] = s[i] + R_WS[0, i] * g[0] + R_WS[1, i] * g[1] + R_WS[2, i] * g[2]
 
@@ -161,7 +171,7 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 def _set_world_at_rest(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
-        x[k] = -table[table.shape[0] - 1, GRAVITY_COLUMN + k]
+        x[k] = -table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN + k]
         x[12 + 4 * k] = 1.0
 
 
@@ -172,8 +182,8 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
     x = np.zeros(21)
     x[12] = x[16] = x[20] = 1.0
     for row in range(n):
-        _advance_pose(table, row, q[row], x)
-    _advance_pose(table, n, 0.0, x)
+        _advance_pose_over_joint(table, row, q[row], x)
+    _advance_pose_over_joint(table, n, 0.0, x)
     for i in range(3):
         p_WS[i] = x[9 + i]
         for k in range(3):
@@ -193,11 +203,11 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
     for row in range(n):
-        _advance_pose(table, row, q[row], x)
+        _advance_pose_over_joint(table, row, q[row], x)
         for i in range(3):
             J_out[i, row] = x[9 + i]
             J_out[3 + i, row] = x[14 + 3 * i]
-    _advance_pose(table, n, 0.0, x)
+    _advance_pose_over_joint(table, n, 0.0, x)
     p_WS = vector_at(x, 9)
     for row in range(n):
         column = J_out[:, row]
@@ -215,8 +225,8 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
     for row in range(n):
-        _advance_motion(table, row, q[row], v[row], vdot[row], out)
-    _advance_motion(table, n, 0.0, 0.0, 0.0, out)
+        _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], out)
+    _advance_motion_over_joint(table, n, 0.0, 0.0, 0.0, out)
     R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
@@ -230,13 +240,13 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
-        _advance_motion(table, row, q[row], v[row], vdot[row], out[row])
+        _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], out[row])
     out[n] = out[n - 1]
-    _advance_motion(table, n, 0.0, 0.0, 0.0, out[n])
+    _advance_motion_over_joint(table, n, 0.0, 0.0, 0.0, out[n])
 
 
 @njit(cache=True, inline="always")
-def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
+def _write_joint_axis_and_link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
@@ -288,10 +298,10 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_motion(table, row, q[row], v[row], vdot[row], x)
+            _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], x)
         else:
-            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
-        _link_wrench(table, row, x, link)
+            _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
+        _write_joint_axis_and_link_wrench(table, row, x, link)
     _project_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR_COLUMN] * vdot[row] + table[row, DAMPING_COLUMN] * v[row]
@@ -304,7 +314,7 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 
 
 @njit(cache=True, inline="always")
-def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
+def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add inertial parameters phi (10,) of a link about Wo, in W, to `inertia` (10,)."""
     phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
     m, h, about_Lo = (
@@ -395,11 +405,11 @@ def forward_dynamics(
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_motion(table, row, q[row], v[row], 0.0, x)
+            _advance_motion_over_joint(table, row, q[row], v[row], 0.0, x)
         else:
-            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
-        _link_wrench(table, row, x, link)
-        _composite_inertia(table, row, x, inertia[row])
+            _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
+        _write_joint_axis_and_link_wrench(table, row, x, link)
+        _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
     _project_on_joints(table, link, vdot_out)

@@ -22,25 +22,25 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
-    GRAVITY_COLUMN,
     IS_PRISMATIC_COLUMN,
+    LAST_ROW_GRAVITY_COLUMN,
     NUM_TABLE_COLUMNS,
     PHI_COLUMN,
     ROTATION_COLUMN,
     ROTOR_COLUMN,
     TRANSLATION_COLUMN,
     ArmModel,
-    Array,
 )
 
-# Default speed of a revolute joint [rad/s]; half range and speed of a prismatic one [m, m/s].
-_DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
+_DEFAULT_SPEED_RAD_S = np.pi
+_DEFAULT_HALF_RANGE_M, _DEFAULT_SPEED_M_S = 1.0, 1.0  # of a prismatic joint
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
-_MAX_PLAUSIBLE_LIMIT = 1e4
+_MAX_PLAUSIBLE_POSITION_LIMIT = 1e4
 # Default time to full speed [s].
 _TIME_TO_FULL_SPEED_S = 0.4
 
@@ -65,7 +65,7 @@ def ArmModelFromPlant(
     inboard_joints = {
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
-    joints = _joint_chain(inboard_joints, frame_S)
+    joints = _moving_joints_to_sensor(inboard_joints, frame_S)
     n = len(joints)
     table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
@@ -73,8 +73,8 @@ def ArmModelFromPlant(
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
-    table[n, GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity.gravity_vector() * gravity.is_enabled(
-        model_instance
+    table[n, LAST_ROW_GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = (
+        gravity.gravity_vector() * gravity.is_enabled(model_instance)
     )
 
     context = plant.CreateDefaultContext()
@@ -105,16 +105,12 @@ def ArmModelFromPlant(
         table=table,
         lower=lower,
         upper=upper,
-        velocity_limit=_array_per_joint([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=_array_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=_array_per_joint([_effort_limit(plant, j) for j in joints]),
+        velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
+        acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
+        effort_limit=np.array([_effort_limit(plant, j) for j in joints]),
         position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
         velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
     )
-
-
-def _array_per_joint(values: list[float]) -> Array:
-    return np.array(values, dtype=np.float64)
 
 
 def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
@@ -123,8 +119,8 @@ def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
     return (
-        -np.inf if lower < -_MAX_PLAUSIBLE_LIMIT else lower,
-        np.inf if upper > _MAX_PLAUSIBLE_LIMIT else upper,
+        -np.inf if lower < -_MAX_PLAUSIBLE_POSITION_LIMIT else lower,
+        np.inf if upper > _MAX_PLAUSIBLE_POSITION_LIMIT else upper,
     )
 
 
@@ -134,7 +130,7 @@ def _joint_axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     return axis
 
 
-def _joint_chain(
+def _moving_joints_to_sensor(
     inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
 ) -> list[RevoluteJoint | PrismaticJoint]:
     body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
@@ -206,7 +202,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
-def with_all_limits(
+def fill_missing_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
@@ -217,7 +213,7 @@ def with_all_limits(
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_range`
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_limits`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -227,7 +223,7 @@ def with_all_limits(
             where=where,
             remedy="correct the limits, or make the joint a fixed one",
         )
-    reach, slide_speed = _DEFAULT_PRISMATIC
+    reach = _DEFAULT_HALF_RANGE_M
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
@@ -236,7 +232,7 @@ def with_all_limits(
         np.where(half_limited & np.isinf(lower), upper - width, lower),
         np.where(half_limited & np.isinf(upper), lower + width, upper),
     )
-    speed = np.where(slides, slide_speed, _DEFAULT_SPEED_RAD_S)
+    speed = np.where(slides, _DEFAULT_SPEED_M_S, _DEFAULT_SPEED_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit
@@ -268,7 +264,7 @@ def with_all_limits(
         (
             ~_is_positive_and_finite(arm.velocity_limit),
             f"a speed limit of {_DEFAULT_SPEED_RAD_S:.4g} rad/s",
-            f"a speed limit of {_DEFAULT_PRISMATIC[1]:g} m/s",
+            f"a speed limit of {_DEFAULT_SPEED_M_S:g} m/s",
         ),
         (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
@@ -286,19 +282,19 @@ def _is_positive_and_finite(limits: Array) -> NDArray[np.bool_]:
     return np.isfinite(limits) & (limits > 0)
 
 
-_MIN_LENGTH_M, _MAX_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
+_MIN_ARM_LENGTH_M, _MAX_ARM_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
 
 
-def check_size(arm: ArmModel, where: str) -> None:
+def check_arm_lengths(arm: ArmModel, where: str) -> None:
     """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
-    if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
+    if 0.0 < length < _MIN_ARM_LENGTH_M or length > _MAX_ARM_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI_COLUMN:], strict=True):
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
-        if distance > _MAX_LENGTH_M:
+        if distance > _MAX_ARM_LENGTH_M:
             what = f"the mass moved by {name} is {distance:.3g} m away from it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

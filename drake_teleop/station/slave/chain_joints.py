@@ -26,7 +26,7 @@ from drake_teleop.station.slave.model.repair_report import join_names
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
-_ROTOR_MASS_KG = 0.14
+_ROTOR_INERTIA_PER_LENGTH_SQUARED_KG = 0.14
 _SLIDER_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
@@ -34,7 +34,7 @@ def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
     return plant.get_joint(index).num_velocities() > 0
 
 
-def check_tree(plant: MultibodyPlant, where: str) -> None:
+def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
     """Raise DrakeTeleopError unless the joints form a tree; Drake aborts on loops."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
@@ -62,7 +62,7 @@ def check_tree(plant: MultibodyPlant, where: str) -> None:
             passed.add(index)
 
 
-def weld_base(
+def weld_base_and_find_chain(
     plant: MultibodyPlant, frame: Frame, X_WBase: RigidTransform | None, where: str
 ) -> list[JointIndex]:
     """Weld a free base to the world at `X_WBase`; return the joints from the base to `frame`.
@@ -99,14 +99,14 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 
 
 def check_chain(
-    plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
+    plant: MultibodyPlant, chain: list[JointIndex], dependence_reasons: dict[str, str], where: str
 ) -> None:
-    """Raise DrakeTeleopError if a joint of the chain has several axes or is in `dependent`."""
+    """Raise DrakeTeleopError if a joint of the chain has several axes or moves with another."""
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
-            if name in dependent:
+            if name in dependence_reasons:
                 raise DrakeTeleopError(
-                    f"{name} {dependent[name]}",
+                    f"{name} {dependence_reasons[name]}",
                     where=where,
                     remedy="the arm up to the sensor has to be a chain of independent joints",
                 )
@@ -162,7 +162,7 @@ def weld_other_joints(
 
 def _replace_joint_by_weld(plant: MultibodyPlant, joint: Joint) -> None:
     name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
-    X_FM = _default_pose(joint)
+    X_FM = _default_joint_pose(joint)
     for k in plant.GetJointActuatorIndices():
         if plant.get_joint_actuator(k).joint().index() == joint.index():
             plant.RemoveJointActuator(plant.get_joint_actuator(k))
@@ -170,7 +170,7 @@ def _replace_joint_by_weld(plant: MultibodyPlant, joint: Joint) -> None:
     plant.AddJoint(WeldJoint(f"{name}_held", *ends, X_FM))
 
 
-def _default_pose(joint: Joint) -> RigidTransform:
+def _default_joint_pose(joint: Joint) -> RigidTransform:
     # Drake's `GetDefaultPose` covers few kinds of joints.
     q = joint.default_positions()
     if isinstance(joint, RevoluteJoint):
@@ -180,7 +180,7 @@ def _default_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def add_actuators(
+def set_one_actuator_per_joint(
     plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float] | None
 ) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain.
@@ -224,21 +224,21 @@ def set_torque_limits(
 
 
 def assume_rotor_inertias(
-    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
+    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary_bodies: frozenset[str]
 ) -> list[str]:
     """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
 
-    Beyond an `auxiliary` body, which the model does not have, the next joint's links count too.
+    Beyond one of `auxiliary_bodies`, absent from the model, the next joint's links count too.
     """
     joints = [plant.get_joint(index) for index in chain]
-    inertia = _ROTOR_MASS_KG * _length_of_moving_chain_m(joints, frame) ** 2
+    inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(joints, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
     for joint in (joint for joint in joints if joint.index() in motor):
         if motor[joint.index()].default_reflected_inertia() > 0.0:
             continue
-        if _has_inertia(plant, joint, auxiliary):
+        if _carries_inertia(plant, joint, auxiliary_bodies):
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
@@ -254,7 +254,7 @@ def assume_rotor_inertias(
     ]
 
 
-def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str]) -> bool:
+def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: frozenset[str]) -> bool:
     ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
     while ahead:
         body: RigidBody = ahead.pop()
@@ -262,7 +262,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
         if body.default_mass() > 0.0 and (isinstance(joint, PrismaticJoint) or moments.any()):
             return True
         outboard = [each for each in joints if each.parent_body().index() == body.index()]
-        through = body.name() in auxiliary
+        through = body.name() in auxiliary_bodies
         ahead += [e.child_body() for e in outboard if through or isinstance(e, WeldJoint)]
     return False
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Container
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import add_force_to_wrench
@@ -19,7 +19,7 @@ from drake_teleop.station.slave.slave_config import Slave
 
 def contact_wrench_W(
     results: ContactResults, bodies: Container[int], shapes: Container[int]
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the wrench (6,) of all contacts on the tool, about the world's origin, in W [N, N m].
 
     `bodies`: indices of the tool's bodies; `shapes`: identifiers of its collision shapes.
@@ -58,10 +58,7 @@ class DrakeContact(LeafSystem):
         output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._tool_ids))
 
 
-Array = NDArray[np.float64]
-
-
-class ContactTwin:
+class ContactPlantCopy:
     """Copy of the slave's plant that computes contact at any state, beside the simulated plant."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
@@ -81,10 +78,13 @@ class ContactTwin:
         half = len(x) // 2
         if len(state):
             plant.SetPositionsAndVelocities(context, state)
-        arm, leaf = (self._slave.instance, slice(half - 1)), (contact.sheet, slice(half - 1, half))
-        for instance, own in (arm, leaf):
+        parts = {
+            self._slave.instance: slice(half - 1),
+            contact.leaf_instance: slice(half - 1, half),
+        }
+        for instance, own in parts.items():
             if instance is not None:
                 plant.SetPositions(context, instance, x[:half][own])
                 plant.SetVelocities(context, instance, x[half:][own])
         results = plant.get_contact_results_output_port().Eval(context)
-        return contact_wrench_W(results, contact.bodies, contact.shapes)
+        return contact_wrench_W(results, contact.tool_bodies, contact.tool_shapes)

@@ -12,19 +12,19 @@ from typing import TypeAlias
 from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError, silent_stderr
 
 #: Expected kind of file, and the remedy for missing packages.
-ModelDescription: TypeAlias = tuple[str, str]
-ROBOT_DESCRIPTION: ModelDescription = ("robot", "with --package-path for package://")
-SCENE_DESCRIPTION: ModelDescription = ("scene", "its package:// addresses in folders around it")
+ExpectedModel: TypeAlias = tuple[str, str]
+EXPECTED_ROBOT: ExpectedModel = ("robot", "with --package-path for package://")
+EXPECTED_SCENE: ExpectedModel = ("scene", "its package:// addresses in folders around it")
 # Places in Drake's source and in repaired texts, which the user does not have.
-_FAILURE_PREFIX = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
-_REPAIRED_TEXT = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_FAILURE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
+_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_COPY_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
+_NUM_ERROR_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 
 
 @contextmanager
 def translate_drake_errors(
-    path: Path, expected: ModelDescription = ROBOT_DESCRIPTION, folder: str = ""
+    path: Path, expected: ExpectedModel = EXPECTED_ROBOT, folder: str = ""
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
@@ -36,12 +36,14 @@ def translate_drake_errors(
         raise
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
-        reason = _REPAIRED_TEXT.sub("", _FAILURE_PREFIX.sub("", " ".join(str(error).split())))
+        reason = _REPAIRED_TEXT_PATTERN.sub(
+            "", _FAILURE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
+        )
         if folder:
             reason = re.sub(_REPAIRED_COPY_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
-        room = MAX_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_SEPARATOR_CHARS
+        room = MAX_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_ERROR_SEPARATOR_CHARS
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, holding_torque
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.station.slave.joint_control import mass_matrix
@@ -16,7 +16,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.slave_config import Slave
 
 # Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
-_MIN_INERTIA_KG_M2 = 1e-9
+_MIN_MASS_MATRIX_EIGENVALUE_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
@@ -26,8 +26,8 @@ _Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 def positions_with_tool_down(
-    arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
-) -> tuple[NDArray[np.float64], IkStatus]:
+    arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
+) -> tuple[Array, IkStatus]:
     """Return joint positions (n,) [rad] for S at `position` (W) [m] and `R_WS`, and `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
@@ -42,7 +42,7 @@ def positions_with_tool_down(
     return q, status
 
 
-def home_posture(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
+def home_posture(arm: ArmModel, position: list[float]) -> Array:
     q, status = positions_with_tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
@@ -57,7 +57,7 @@ def home_posture(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
     return q
 
 
-def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
+def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     if not slave.home:
         return home_posture(arm, slave.position)
     if len(slave.home) != arm.num_joints:
@@ -79,9 +79,9 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
     return q
 
 
-def check_motor_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
+def check_motor_strength(arm: ArmModel, q: Array) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA_KG_M2:
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
         raise DrakeTeleopError(
             "the mass matrix is singular: the links have too little inertia",
             where="slave.model",

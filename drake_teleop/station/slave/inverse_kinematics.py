@@ -11,15 +11,13 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, forward_kinematics
-
-Array = NDArray[np.float64]
 
 SHOULDER_HEIGHT_M = 0.420
 """Base to shoulder [m]."""
@@ -31,7 +29,7 @@ FLANGE_OFFSET_M = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
-_SINGULAR_THRESHOLD = 1e-9
+_MAX_SINGULAR_DISTANCE_OR_SINE = 1e-9
 # Tolerance of a joint limit [rad]; the angle is clipped to the limit.
 _LIMIT_TOLERANCE_RAD = 1e-9
 
@@ -67,12 +65,11 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _all_solutions_into(
-    R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array
-) -> int:
+def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
     """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
-    Out of reach they are nan, or with `clamp` those of the nearest reachable wrist centre.
+    Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
+    q5 <= 0. Out of reach they are those of the nearest reachable wrist centre.
     """
     status = _OK
     x = p[0] - FLANGE_OFFSET_M * R[0, 2]
@@ -82,15 +79,12 @@ def _all_solutions_into(
     inner_reach = abs(UPPER_ARM_LENGTH_M - FOREARM_LENGTH_M)
     distance = np.sqrt(x * x + y * y + z * z)
     if distance > reach or distance < inner_reach:
-        if not clamp:
-            q[:] = np.nan
-            return _OUT_OF_REACH
         scale = (reach if distance > reach else inner_reach) / distance
         x, y, z = scale * x, scale * y, scale * z
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _SINGULAR_THRESHOLD:
+    if rho < _MAX_SINGULAR_DISTANCE_OR_SINE:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
@@ -119,7 +113,7 @@ def _all_solutions_into(
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _SINGULAR_THRESHOLD else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SINE else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -134,7 +128,7 @@ def _all_solutions_into(
 
 
 @njit(cache=True)
-def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
+def _wrap_angle_into_limits(angle: float, near: float, lower: float, upper: float) -> float:
     """Return the angle plus full turns that is nearest to `near` within the limits, or nan."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
@@ -159,13 +153,13 @@ def _nearest_branch_into(
     if not (np.isfinite(R.sum()) and all_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _all_solutions_into(R, p, reference[0], reference[3], True, branches)
+    status = _all_solutions_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):
         distance = 0.0
         for i in range(6):
-            angle = _wrap_to_limits(branches[row, i], reference[i], lower[i], upper[i])
+            angle = _wrap_angle_into_limits(branches[row, i], reference[i], lower[i], upper[i])
             step = abs(angle - reference[i])
             # A nan (outside the limits) also gives inf.
             distance += step * step if step <= max_step else np.inf
@@ -175,7 +169,7 @@ def _nearest_branch_into(
     if best < 0:
         return _JOINT_LIMIT
     copy_into(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _SINGULAR_THRESHOLD:
+    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SINE:
         status = max(status, _WRIST_SINGULAR)
     return status
 
@@ -193,17 +187,6 @@ def solve_pose_command(
     R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
     R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
     return _nearest_branch_into(R, pose[4:7], reference, lower, upper, max_step, q)
-
-
-def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
-    """Return the eight solutions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
-
-    Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
-    q5 <= 0. Joint limits are ignored; an undetermined joint is 0.
-    """
-    q = np.empty((8, 6))
-    _all_solutions_into(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
-    return q - 2.0 * np.pi * np.ceil(q / (2.0 * np.pi) - 0.5)
 
 
 def nearest_branch(
@@ -241,7 +224,7 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    At a joint limit the command stays instead of jumping to another solution, see `MAX_STEP`.
+    At a joint limit the command stays and does not jump to another solution (`MAX_JOINT_STEP_RAD`).
 
     .. pydrake_system::
 
@@ -256,7 +239,7 @@ class InverseKinematics(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    MAX_STEP = 2.0
+    MAX_JOINT_STEP_RAD = 2.0
     """Largest joint displacement [rad]; joints 4 and 6 may need 90 degrees past q5 = 0."""
 
     def __init__(self, lower: Array, upper: Array) -> None:
@@ -275,7 +258,7 @@ class InverseKinematics(LeafSystem):
             self._position.Eval(context),
             self._lower,
             self._upper,
-            self.MAX_STEP,
+            self.MAX_JOINT_STEP_RAD,
             q,
         )
 

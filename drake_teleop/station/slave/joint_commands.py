@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
@@ -20,9 +20,7 @@ from drake_teleop.station.slave.inverse_kinematics import (
 )
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 
-Array = NDArray[np.float64]
-
-AUTOMATIC_METHOD = "automatic"
+AUTOMATIC_IK_METHOD = "automatic"
 """Name that selects the closed form where it exists, otherwise the numeric method."""
 
 IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
@@ -42,18 +40,18 @@ _RANGE_TOLERANCE_SHARE = 0.01
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
     """Return the key in `IK_METHODS` for setting `name`; DrakeTeleopError if the arm has none."""
-    if name == AUTOMATIC_METHOD:
+    if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
         raise DrakeTeleopError(
             "the closed form requires the geometry of an RX90 with its base at the world's origin",
             where="slave.inverse_kinematics",
-            remedy=f"set it to {AUTOMATIC_METHOD} or numeric",
+            remedy=f"set it to {AUTOMATIC_IK_METHOD} or numeric",
         )
     return name
 
 
-class JointFollower(LeafSystem):
+class LeaderJointFollower(LeafSystem):
     """Block that follows the leader's joints (n,) [rad] within limits of position and speed.
 
     Invalid input keeps the last command.
@@ -90,7 +88,7 @@ class JointFollower(LeafSystem):
         discrete_state.set_value(0, self._next_command(context)[0])
 
 
-class JointTrajectory(LeafSystem):
+class ExcitationCommand(LeafSystem):
     """Block that commands one period of an excitation trajectory from `start` [s], else rest."""
 
     __slots__ = ONE_DICT
@@ -105,7 +103,7 @@ class JointTrajectory(LeafSystem):
         output.SetFromVector(self._trajectory.evaluate(time)[0])
 
 
-class SlaveMonitor(LeafSystem):
+class JointRangeMonitor(LeafSystem):
     """Block that raises DrakeTeleopError if a joint leaves its range by over 1 % of the range."""
 
     __slots__ = ONE_DICT

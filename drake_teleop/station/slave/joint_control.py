@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import (
     ArmModel,
@@ -26,8 +26,6 @@ from drake_teleop.station.slave.position_servo import (
     PositionInterface,
     PositionServo,
 )
-
-Array = NDArray[np.float64]
 
 COMPUTED_TORQUE_NAME = "computed_torque"
 
@@ -66,7 +64,7 @@ class JointControlConfig:
         return 1 / (2 * np.pi * min(self.position_bandwidth_hz, self.velocity_bandwidth_hz))
 
     @property
-    def speed_gain(self) -> float:
+    def position_loop_gain_per_s(self) -> float:
         """Commanded joint speed divided by the position error [1/s]."""
         interface = self.position_interface
         return (
@@ -100,7 +98,7 @@ class JointControlConfig:
 
 
 @njit(cache=True, borrows=True)
-def joint_control_torque(
+def computed_torque_into(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
@@ -173,7 +171,7 @@ class JointControl(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        joint_control_torque(
+        computed_torque_into(
             self._arm,
             self._command.Eval(context),
             self._state.Eval(context),
@@ -214,7 +212,7 @@ def MakeJointControl(
     return PositionServo(arm, interface, period, q_start)
 
 
-def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
+def position_interface_of_block(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the position interface that `servo` in a `joint_control` block names, or None."""
     return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 

@@ -6,24 +6,21 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 
-Array = NDArray[np.float64]
-
-FRICTION_SPEED = 2e-3
+FRICTION_TANH_SPEED = 2e-3
 """Speed v_0 of the friction law [rad/s, m/s], estimate."""
 
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
     """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
-    return -coulomb * np.tanh(speed / FRICTION_SPEED)
+    return -coulomb * np.tanh(speed / FRICTION_TANH_SPEED)
 
 
 @njit(cache=True)
@@ -34,7 +31,7 @@ def _friction_into(coulomb, index, state, force):
         force[index[i]] = dry_friction(coulomb[i], state[n + i])
 
 
-def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
+def expand_friction_per_joint(values: list[float], joints: tuple[str, ...]) -> Array:
     """Return friction torques (n,) [N m] from 0, 1 or n values, else raise DrakeTeleopError."""
     n = len(joints)
     if len(values) not in (0, 1, n):
@@ -64,19 +61,3 @@ class JointFriction(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
-
-
-def AddJointFriction(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    instance: ModelInstanceIndex,
-    coulomb: Array,
-    index: NDArray[np.intp],
-) -> None:
-    friction = builder.AddNamedSystem(
-        "joint_friction", JointFriction(coulomb, index, plant.num_velocities())
-    )
-    state = plant.get_state_output_port(instance)
-    builder.Connect(state, friction.GetInputPort("slave_state"))
-    force = plant.get_applied_generalized_force_input_port()
-    builder.Connect(friction.GetOutputPort("generalized_force"), force)

@@ -18,10 +18,10 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
-from drake_teleop.station.slave.chain_joints import check_tree
+from drake_teleop.station.slave.chain_joints import check_joints_form_tree
 from drake_teleop.station.slave.drake_errors import (
-    ROBOT_DESCRIPTION,
-    SCENE_DESCRIPTION,
+    EXPECTED_ROBOT,
+    EXPECTED_SCENE,
     raise_logged_errors,
     translate_drake_errors,
 )
@@ -41,18 +41,18 @@ class ModelInPlant(NamedTuple):
 
     Attributes:
         effort_limits: limits by joint, unlimited without an entry; None: those of the actuators.
-        folder: folder of converted meshes, which Drake reads later.
+        mesh_folder: folder of converted meshes, which Drake reads later.
     """
 
     instances: list[ModelInstanceIndex]
     assumptions: list[str]
     effort_limits: dict[str, float] | None
-    dependent: dict[str, str]
-    auxiliary: frozenset[str]
-    folder: TemporaryDirectory[str]
+    dependence_reasons: dict[str, str]
+    auxiliary_bodies: frozenset[str]
+    mesh_folder: TemporaryDirectory[str]
 
 
-def read_model(
+def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> ModelInPlant:
     """Repair the text of a model file and parse it into a plant."""
@@ -66,18 +66,18 @@ def read_model(
     if kind == ".yaml":
         read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
     files = ModelFiles(path, package_paths)
-    purpose = purpose._replace(has_geometry=plant.geometry_source_is_registered())
+    purpose = purpose._replace(plant_has_shapes=plant.geometry_source_is_registered())
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
-    files.merge_packages(parser.package_map())
+    files.add_packages_to_map(parser.package_map())
     files.check_file(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
-    expected = SCENE_DESCRIPTION if purpose.is_scene else ROBOT_DESCRIPTION
+    expected = EXPECTED_SCENE if purpose.is_scene else EXPECTED_ROBOT
     with translate_drake_errors(path, expected, folder.name):
         read = _add_directives if kind == ".yaml" else _add_file
         instances, repaired = read(parser, path, files, purpose, folder)
-        check_tree(plant, str(path))
+        check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         raise DrakeTeleopError(
             "the model has springs or other force elements, which are not supported",
@@ -89,8 +89,8 @@ def read_model(
         instances,
         list(dict.fromkeys(text for each in repaired for text in each.assumptions)),
         {n: x for each in repaired for n, x in each.effort_limits.items()} if is_complete else None,
-        {name: why for each in repaired for name, why in each.dependent.items()},
-        frozenset(name for each in repaired for name in each.auxiliary),
+        {name: why for each in repaired for name, why in each.dependence_reasons.items()},
+        frozenset(name for each in repaired for name in each.auxiliary_bodies),
         folder,
     )
 

@@ -13,30 +13,30 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoi
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.chain_joints import (
-    add_actuators,
     assume_rotor_inertias,
     check_chain,
     is_joint_moving,
-    weld_base,
+    set_one_actuator_per_joint,
+    weld_base_and_find_chain,
     weld_free_bodies,
     weld_joints_at,
     weld_other_joints,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
-from drake_teleop.station.slave.model_files import read_model
+from drake_teleop.station.slave.model_files import repair_and_parse_model
 
 _MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Arm that was parsed into a plant; `folder` contains meshes, which Drake reads later."""
+    """Arm that was parsed into a plant; `mesh_folder` contains meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
     assumptions: list[str]
-    folder: TemporaryDirectory[str]
+    mesh_folder: TemporaryDirectory[str]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ParsedTool:
 
     body: RigidBody
     assumptions: list[str]
-    folder: TemporaryDirectory[str] | None = None
+    mesh_folder: TemporaryDirectory[str] | None = None
 
 
 def ParseModel(
@@ -63,17 +63,17 @@ def ParseModel(
     models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
-    read = read_model(plant, path, package_paths, ModelPurpose(sensor_frame, hold))
-    frame = _sensor_frame(plant, read.instances, sensor_frame, where)
+    read = repair_and_parse_model(plant, path, package_paths, ModelPurpose(sensor_frame, hold))
+    frame = _find_sensor_frame(plant, read.instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
     held = weld_joints_at(plant, hold, added)
-    chain = weld_base(plant, frame, X_WBase, where)
-    check_chain(plant, chain, read.dependent, where)
+    chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
+    check_chain(plant, chain, read.dependence_reasons, where)
     free = weld_free_bodies(plant, read.instances)
     with translate_drake_errors(path):
         held += weld_other_joints(plant, before, chain)
-        add_actuators(plant, chain, read.effort_limits)
-        rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary)
+        set_one_actuator_per_joint(plant, chain, read.effort_limits)
+        rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary_bodies)
     instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
@@ -84,7 +84,7 @@ def ParseModel(
         )
     instance = next(iter(instances), frame.model_instance())
     assumptions = [*read.assumptions, *free, *held, *rotors]
-    return ParsedModel(instance, frame, assumptions, read.folder)
+    return ParsedModel(instance, frame, assumptions, read.mesh_folder)
 
 
 def ParseTool(
@@ -92,7 +92,7 @@ def ParseTool(
 ) -> ParsedTool:
     """Parse a tool, weld its root link to S by the joint "sensor_weld", and weld its own joints."""
     before = set(plant.GetJointIndices())
-    read = read_model(plant, path, package_paths, ModelPurpose(is_tool=True))
+    read = repair_and_parse_model(plant, path, package_paths, ModelPurpose(is_tool=True))
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
@@ -107,22 +107,22 @@ def ParseTool(
         assumptions = [*read.assumptions, *weld_other_joints(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return ParsedTool(roots[0], assumptions, read.folder)
+    return ParsedTool(roots[0], assumptions, read.mesh_folder)
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """Parse the surroundings of an arm; return the folder of their converted meshes."""
-    read = read_model(plant, path, (), ModelPurpose(is_scene=True))
-    for name, what in read.dependent.items():
+    read = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
+    for name, what in read.dependence_reasons.items():
         raise DrakeTeleopError(
             f"{name} {what}",
             where=str(path),
             remedy="correct it; every object that the tool could touch must be readable",
         )
-    return read.folder
+    return read.mesh_folder
 
 
-def _sensor_frame(
+def _find_sensor_frame(
     plant: MultibodyPlant, instances: list[ModelInstanceIndex], name: str, where: str
 ) -> Frame:
     with_frame = [index for index in instances if plant.HasFrameNamed(name, index)]

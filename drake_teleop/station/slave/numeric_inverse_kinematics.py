@@ -8,11 +8,11 @@ sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     copy_into,
@@ -34,8 +34,6 @@ from drake_teleop.station.slave.arm import (
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
-Array = NDArray[np.float64]
-
 POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
@@ -43,7 +41,7 @@ POSE_TOLERANCE_M = 1e-8
 _ROUNDING_ERROR_M = 1e-14
 MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
-MAX_STEPS = 10
+MAX_STEPS_PER_COMMAND = 10
 """Maximum number of Levenberg-Marquardt steps per command; two or three are typical."""
 # Minimum damping of a step [m^2], which keeps redundant joints at rest.
 _MIN_DAMPING = 1e-14
@@ -56,7 +54,7 @@ _REACH_TOLERANCE_M = 5e-6
 # The same tolerance for `find_posture`, which stops the search earlier [m].
 _SEARCH_TOLERANCE_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
-_ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
+_MAX_ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
 _MAX_COPLANAR_VOLUME = 0.1
 
@@ -93,7 +91,7 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 
 @njit(cache=True)
-def _normal_matrix(J, H):
+def _gram_matrix_into(J, H):
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -109,7 +107,7 @@ def _normal_matrix(J, H):
 
 
 @njit(cache=True)
-def _smallest_eigenvalue(H, u):
+def _find_smallest_eigenpair(H, u):
     m = H.shape[0]
     M = np.empty((m, m))
     for i in range(m):
@@ -228,8 +226,8 @@ def follow_pose(
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
     squared = _jacobian_and_error(table, L, pose, q, x, J, e)
-    _normal_matrix(J, B)
-    damping = max(singular * singular - _smallest_eigenvalue(B, u), 0.0)
+    _gram_matrix_into(J, B)
+    damping = max(singular * singular - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
         copy_into(anchor, 0, q, 0, n)
@@ -242,7 +240,7 @@ def follow_pose(
             ):
                 break
             if better:
-                _normal_matrix(J, H)
+                _gram_matrix_into(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i])
                     for k in range(6):
@@ -299,10 +297,10 @@ def follow_pose(
         copy_into(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
-        _smallest_eigenvalue(H, g)
+        _find_smallest_eigenpair(H, g)
         size = _SEARCH_ESCAPE_STEP
         if singular > 0.0:
-            size = min(_ESCAPE_STEP, 10.0 * np.sqrt(squared) / L)
+            size = min(_MAX_ESCAPE_STEP, 10.0 * np.sqrt(squared) / L)
         slope = 0.0
         for i in range(n):
             for k in range(6):
@@ -374,7 +372,7 @@ def _follow_command(
     if elapsed > 0.0:  # inf * 0 is nan
         for i in range(n):
             max_step[i] = speed[i] * elapsed
-    steps = np.int64(MAX_STEPS)  # a literal would compile `follow_pose` again
+    steps = np.int64(MAX_STEPS_PER_COMMAND)  # a literal would compile `follow_pose` again
     return follow_pose(
         table, L, pose, reference, lower, upper, max_step, posture, min(pull * elapsed, 1.0),
         MIN_SINGULAR_VALUE_M, steps, q,
@@ -390,7 +388,7 @@ class NumericInverseKinematics(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    PULL = 1.0
+    POSTURE_RATE_PER_S = 1.0
     """Rate at which a redundant arm approaches its posture [1/s]."""
 
     def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
@@ -412,10 +410,8 @@ class NumericInverseKinematics(LeafSystem):
 
     def _solve_command(self, context: Context, q: Array) -> int:
         last = context.get_discrete_state_vector().value()
-        time, pose, position = context.get_time(), self._pose, self._position
-        status: int = _follow_command(
-            *self._fixed, self.PULL, pose.Eval(context), position.Eval(context), last, time, q
-        )
+        time, inputs = context.get_time(), (self._pose.Eval(context), self._position.Eval(context))
+        status: int = _follow_command(*self._fixed, self.POSTURE_RATE_PER_S, *inputs, last, time, q)
         return status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:

@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RotationMatrix
@@ -21,14 +20,17 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_kinematics, pose_into
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
+from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, pose_into
+from drake_teleop.station.slave.arm_from_plant import (
+    ArmModelFromPlant,
+    check_arm_lengths,
+    fill_missing_limits,
+)
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, start_posture
-from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
+from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, find_start_posture
+from drake_teleop.station.slave.joint_friction import JointFriction, expand_friction_per_joint
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
@@ -65,21 +67,16 @@ class SlavePlant:
     sensor_frame: Frame
     tool: BodyIndex
     arm: ArmModel
-    start: NDArray[np.float64]
-    X_WS_start: NDArray[np.float64]
-    tip: NDArray[np.float64]
+    start: Array
+    X_WS_start: Array
+    tip: Array
     contact: ToolContactModel
     assumptions: tuple[str, ...]
     config: Slave
     environment: Environment | None
 
-    @property
-    def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs of shapes (k, 28) that the compiled contact law covers, `ShapePairs.known`."""
-        return self.contact.pairs
-
     @cached_property
-    def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
+    def physics_of_plant(self) -> tuple[Array, ...]:
         """Argument `physics` of `plant_rates`.
 
         It contains the arm's table with dry friction, and the load in this table, which a grasp
@@ -88,36 +85,32 @@ class SlavePlant:
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
-        contact = self.contact.pairs, self.contact.leaf, self.contact.joints
-        return carried.table, carried.load, *contact, np.zeros((0, 0))
+        contact, no_wrenches = self.contact, np.zeros((0, 0))
+        laws = contact.compiled_pairs, contact.leaf_parameters, contact.joint_table
+        return carried.table, carried.phi_load_view, *laws, no_wrenches
 
     @property
-    def joint_friction(self) -> NDArray[np.float64]:
-        return friction_of_joints(self.config.friction, self.arm.joint_names)
-
-    @property
-    def sheet_instance(self) -> ModelInstanceIndex | None:
-        """Model instance of the sheet spring's leaf or another `moving_part`, or None."""
-        return self.contact.sheet
+    def joint_friction(self) -> Array:
+        return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
 
     @property
     def can_touch(self) -> bool:
-        return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
+        return len(self.contact.compiled_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
-    def sheet_in_compiled_law(self) -> ModelInstanceIndex | None:
-        """`sheet_instance` if the compiled contact law computes its contact, else None."""
-        return None if self.contact.beyond else self.sheet_instance
+    def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
+        """`contact.leaf_instance` if the compiled law computes its contact, else None."""
+        return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
     @property
-    def start_tip(self) -> NDArray[np.float64]:
+    def start_tip(self) -> Array:
         """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
         R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
         return start[4:] + R_WS.matrix() @ self.tip
 
 
-def start_pose(slave: Slave) -> NDArray[np.float64]:
+def start_pose(slave: Slave) -> Array:
     """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
@@ -151,7 +144,7 @@ def AddSlavePlant(
     builder: DiagramBuilder,
     slave: Slave,
     environment: Environment | None,
-    q_start: NDArray[np.float64] | None = None,
+    q_start: Array | None = None,
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the start of `slave`.
 
@@ -174,15 +167,20 @@ def AddSlavePlant(
     if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_arm_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
+        _remove_arm_shapes(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
-    start = start_posture(slave, arm) if q_start is None else q_start
+    start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         check_motor_strength(arm, start)
-    friction = friction_of_joints(slave.friction, arm.joint_names)
+    friction = expand_friction_per_joint(slave.friction, arm.joint_names)
     if friction.any():
-        AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
+        law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
+        block = builder.AddNamedSystem("joint_friction", law)
+        state = plant.get_state_output_port(instance)
+        builder.Connect(state, block.GetInputPort("slave_state"))
+        force = plant.get_applied_generalized_force_input_port()
+        builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = np.empty(7) if slave.home else start_pose(slave)
     if slave.home:
@@ -213,7 +211,7 @@ class ParsedSlave:
     sensor_frame: Frame
     tool: BodyIndex
     assumptions: tuple[str, ...]
-    folders: list[TemporaryDirectory[str]]
+    mesh_folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
         """Return the arm, after the plant is finalized, and the assumptions about its limits."""
@@ -225,8 +223,8 @@ class ParsedSlave:
                 where="slave.tool",
                 remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
             )
-        check_size(arm, str(self.slave.path))
-        arm, assumed = with_all_limits(arm, str(self.slave.path))
+        check_arm_lengths(arm, str(self.slave.path))
+        arm, assumed = fill_missing_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
             assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
@@ -244,12 +242,12 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         )
     plant.RenameModelInstance(model.instance, ARM_INSTANCE_NAME)
     set_torque_limits(plant, model.instance, slave.torque_limits)
-    frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
-    assumptions, folders = [*model.assumptions], [model.folder]
+    frame, model_bodies = model.sensor_frame, bodies_carried_by(plant, model.sensor_frame.body())
+    assumptions, folders = [*model.assumptions], [model.mesh_folder]
     if slave.tool is not None:
         tool = AddTool(plant, slave.tool, frame, slave.package_folders)
         assumptions += tool.assumptions
-        folders += [tool.folder] if tool.folder is not None else []
+        folders += [tool.mesh_folder] if tool.mesh_folder is not None else []
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
             assumptions.append(f"{names} of the model on the sensor beside the tool")
@@ -262,11 +260,11 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     )
 
 
-def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
     """Return the bodies that a body carries through joints, the nearest first."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
-    return near + [far for each in near for far in bodies_beyond(plant, each)]
+    return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
 def finalize_plant(plant: MultibodyPlant) -> None:
@@ -296,13 +294,13 @@ def _remove_arm_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hull_corners_on_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
+def _hull_corners_beyond_sensor_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
     context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
     hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
-    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
+    for body in bodies_carried_by(plant, parsed.sensor_frame.body()):
         X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
         for shape in plant.GetCollisionGeometriesForBody(body):
             X_SShape = X_SBody @ inspector.GetPoseInFrame(shape)
@@ -317,16 +315,14 @@ def _hull_corners_on_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _farthest_point_along_z(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _farthest_point_along_z(hulls: list[Array]) -> Array:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
 
-def _tip_of_tool(
-    plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
-) -> NDArray[np.float64]:
+def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
     instance = plant.get_body(parsed.tool).model_instance()
@@ -340,32 +336,19 @@ def _tip_of_tool(
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hull_corners_on_sensor_S(slave)):
+    if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
         return _farthest_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """Kinematics of an arm: joint names from the base outwards, and `ArmModel.table`."""
-
-    joint_names: tuple[str, ...]
-    table: Array
-
-    def pose(self, q: Array) -> Array:
-        """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
-        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-        forward_kinematics(self.table, q, R_WS, p_WS)
-        return np.concatenate([quaternions_from_matrices(R_WS[None])[0], p_WS])
-
-
-def arm_of_model_file(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
-    """Return the kinematics of the arm in a model file, or raise DrakeTeleopError."""
+def read_arm_kinematics(
+    model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
+) -> ArmModel:
+    """Return the arm in a model file, without default limits, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
         finalize_plant(plant)
-        found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
-    arm = Arm(found.joint_names, found.table)
-    arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
+        arm = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    arm.pose(np.zeros(arm.num_joints))  # Load the compiled function before the first reading.
     return arm

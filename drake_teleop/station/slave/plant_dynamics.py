@@ -20,7 +20,7 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
-    BODY_COLUMN,
+    BODY_ROW_COLUMN,
     NUM_PAIR_COLUMNS,
     contact_force,
     depth_of_sphere_in_box,
@@ -41,8 +41,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
     Args:
         arm: `ArmModel.table`.
-        pairs: (k, 28) pairs of shapes, `ShapePairs.known`.
-        joints: (m, 21) joints of moving bodies, `JointTable`.
+        pairs: (k, 28) pairs of shapes, `ShapePairs.compiled_pairs`.
+        joints: (m, 21) joints of moving bodies, from `MakeJointTable`.
         applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
@@ -60,7 +60,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        box = _place_box_at_body(pair, bodies, placed)
         depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -73,8 +73,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
-        if pair[BODY_COLUMN] >= 0.0:
-            body = bodies[int(pair[BODY_COLUMN])]
+        if pair[BODY_ROW_COLUMN] >= 0.0:
+            body = bodies[int(pair[BODY_ROW_COLUMN])]
             lever = minus(vector_at(normal, 3), vector_at(body, 4))
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
@@ -85,8 +85,10 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
-    """Write a pair, with its box at the present pose of the body, to `placed` (28,); return it."""
-    body = bodies[int(pair[BODY_COLUMN])]
+    """Return a pair with its box at the present pose of the body, as `placed` (28,) if it moves."""
+    if pair[BODY_ROW_COLUMN] < 0.0:
+        return pair
+    body = bodies[int(pair[BODY_ROW_COLUMN])]
     copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
@@ -106,14 +108,11 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
-        if pair[BODY_COLUMN] >= 0.0:
-            _place_box_at_body(pair, bodies, placed)
-        else:
-            copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
-        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
+        box = _place_box_at_body(pair, bodies, placed)
+        if min_distance_of_boxes(pair, box, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        box = _place_box_at_body(pair, bodies, placed)
         if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
             return PROXIMITY_TOUCHING
     return PROXIMITY_FAR
@@ -138,14 +137,14 @@ class ToolContact(LeafSystem):
     def __init__(self, arm: ArmModel, contact: ToolContactModel) -> None:
         super().__init__()
         n = self._n = arm.num_joints
-        self._contact = arm.table, contact.pairs, contact.joints, np.zeros(6)
+        self._contact = arm.table, contact.compiled_pairs, contact.joint_table, np.zeros(6)
         self._nothing = np.zeros(2)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._sheet = self._plant = None
-        if contact.sheet is not None:
+        if contact.leaf_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        if contact.plant_size:
-            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
+        if contact.plant_state_size:
+            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)
         self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:

@@ -9,19 +9,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
 # then target, r and dr/dt (n each), and the queue of commands.
-_COUNT_INDEX, _OLDEST_COMMAND_INDEX = 0, 1
+_PERIODS_SINCE_COMMAND_INDEX, _OLDEST_COMMAND_INDEX = 0, 1
 # Braking v^2 = 2 a d with 80 % of the largest acceleration.
 _BRAKING_FACTOR = 2 * 0.8
 
@@ -96,13 +96,13 @@ def _generate_reference(command, interface, limits, memory, reference):
         interface: (6,) period [s], gain [1/s^2], lookahead [s], drive bandwidth [rad/s], periods
             per command, length of the command queue.
         limits: (2, n) speed and acceleration limits.
-        memory: memory of `PositionServo`, see `_COUNT_INDEX`; updated.
+        memory: memory of `PositionServo`, see `_PERIODS_SINCE_COMMAND_INDEX`; updated.
         reference: (3, n) output: reference position, velocity, acceleration.
     """
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_COUNT_INDEX] == 0.0 and all_in_range(command):
+    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and all_in_range(command):
         if queued > 0.0:
             place = 2 + 3 * n + int(memory[_OLDEST_COMMAND_INDEX]) * n
             copy_into(target, 0, memory, place, n)
@@ -110,7 +110,7 @@ def _generate_reference(command, interface, limits, memory, reference):
             memory[_OLDEST_COMMAND_INDEX] = (memory[_OLDEST_COMMAND_INDEX] + 1.0) % queued
         else:
             copy_into(target, 0, command, 0, n)
-    memory[_COUNT_INDEX] = (memory[_COUNT_INDEX] + 1.0) % every
+    memory[_PERIODS_SINCE_COMMAND_INDEX] = (memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
         fastest = min(limits[0, i], math.sqrt(_BRAKING_FACTOR * limits[1, i] * abs(away)))
@@ -164,7 +164,7 @@ class PositionServo(LeafSystem):
         arm: ArmModel,
         interface: PositionInterface,
         period: float,
-        q_start: NDArray[np.float64],
+        q_start: Array,
     ) -> None:
         super().__init__()
         n = arm.num_joints

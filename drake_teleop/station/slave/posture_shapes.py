@@ -44,7 +44,7 @@ from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
     ParseSlave,
-    bodies_beyond,
+    bodies_carried_by,
     finalize_plant,
 )
 from drake_teleop.station.slave.slave_config import Slave
@@ -54,7 +54,7 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 MIN_OVERLAP_M = 1e-3
 _MAX_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
-_NUM_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
+_NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
 _MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
 _NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
 
@@ -89,7 +89,7 @@ class PostureShapes:
         if environment is not None:
             AddEnvironment(self.plant, environment)
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
-        beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
+        beyond = bodies_carried_by(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
         if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
@@ -132,7 +132,7 @@ class PostureShapes:
     def tool_body(self) -> BodyIndex:
         return self._parsed.tool
 
-    def sensor_bodies(self) -> set[BodyIndex]:
+    def bodies_welded_to_sensor(self) -> set[BodyIndex]:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
@@ -146,10 +146,10 @@ class PostureShapes:
 
     def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         return np.vstack(
-            [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
+            [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hull_points_W(body))]
         )
 
-    def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
+    def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
         """Return, for each shape of a body, points (k, 3) on its convex hull in W [m]."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
@@ -213,9 +213,9 @@ class PostureShapes:
 
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
-        least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_POSTURES))
+        least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_SAMPLED_POSTURES))
         limits = joint_sampling_range(self.arm)
-        for left in range(_NUM_POSTURES, 0, -1):
+        for left in range(_NUM_SAMPLED_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
             counts.update(p for p in self._distances_of_bodies() if not self.surroundings & set(p))
             if max(counts.values(), default=0) + left <= least:
@@ -248,10 +248,10 @@ def _cached_start_overlaps(
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
-    return tuple(overlap_texts(shapes)), tuple(shapes.assumptions)
+    return tuple(overlap_warnings(shapes)), tuple(shapes.assumptions)
 
 
-def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
+def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     """Return a warning for each pair of overlapping bodies, with `of_arm` only of slave bodies."""
     found = []
     for first, second, distance in shapes.overlaps():

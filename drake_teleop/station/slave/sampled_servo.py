@@ -9,22 +9,20 @@ The plant receives the torque a + b (t - h/2), with the area and first moment of
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
-    joint_control_torque,
+    computed_torque_into,
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
-
-Array = NDArray[np.float64]
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
 _MIN_EVENT_HZ = 2000.0
@@ -44,7 +42,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 
 @njit(cache=True)
-def torque_line_into(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
+def predict_torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
     """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
@@ -67,7 +65,7 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
     for k in range(samples):
         copy_into(predicted, 0, x, 0, n)
         copy_into(predicted, n, x, n + 1, n)
-        joint_control_torque(
+        computed_torque_into(
             arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
         )
         for i in range(n):
@@ -125,7 +123,7 @@ class SampledServo(LeafSystem):
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
-        if slave.sheet_in_compiled_law is not None:
+        if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, q_start)
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
@@ -145,7 +143,7 @@ class SampledServo(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
-        torque_line_into(
+        predict_torque_line(
             self._arm,
             self._command.Eval(context),
             self._state.Eval(context),

@@ -24,7 +24,7 @@ from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 #: Folders of converted meshes, kept while the process runs.
-_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
+_KEPT_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
 _RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
 _MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
 
@@ -73,7 +73,7 @@ class Scene(Environment):
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
-            _MESH_FOLDERS.append(folder)
+            _KEPT_MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_BODY_NAMES:
@@ -107,7 +107,9 @@ class Scene(Environment):
         inspector = scene_graph.model_inspector()
         own = [shape for each in ToolShapes(plant, scene_graph, tool).values() for shape in each]
         others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
-        if not any(is_hydroelastic(inspector.GetProximityProperties(shape)) for shape in others):
+        if not any(
+            has_hydroelastic_properties(inspector.GetProximityProperties(shape)) for shape in others
+        ):
             raise DrakeTeleopError(
                 "contact is hydroelastic, but no shape in the file is",
                 where=str(self.path),
@@ -116,7 +118,7 @@ class Scene(Environment):
             )
         for shape in own:
             properties = ProximityProperties(inspector.GetProximityProperties(shape))
-            if not is_hydroelastic(properties):
+            if not has_hydroelastic_properties(properties):
                 AddCompliantHydroelasticProperties(
                     _MESH_RESOLUTION_M, self.tool_modulus, properties
                 )
@@ -125,5 +127,5 @@ class Scene(Environment):
                 )
 
 
-def is_hydroelastic(properties: ProximityProperties) -> bool:
+def has_hydroelastic_properties(properties: ProximityProperties) -> bool:
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

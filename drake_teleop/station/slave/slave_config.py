@@ -12,7 +12,7 @@ from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.slave.joint_commands import AUTOMATIC_METHOD, IK_METHODS
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_METHODS
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 
 
@@ -35,8 +35,8 @@ class Slave:
     )
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
-        AUTOMATIC_METHOD,
-        (AUTOMATIC_METHOD,),
+        AUTOMATIC_IK_METHOD,
+        (AUTOMATIC_IK_METHOD,),
         "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
         " speeds; automatic: closed_form where possible",
         IK_METHODS,

@@ -7,7 +7,6 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
@@ -25,17 +24,18 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
     BODY_STATE_SIZE,
     NUM_JOINT_COLUMNS,
-    JointTable,
+    MakeJointTable,
     poses_and_twists_into,
 )
 from drake_teleop.station.environment.point_contact import (
     NUM_MONITORED_COLUMNS,
     NUM_PAIR_COLUMNS,
-    ContactPairs,
+    FindContactPairs,
 )
 
 _FRAME_TOLERANCE = 1e-12  # rounding of frames
@@ -43,58 +43,56 @@ _MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue o
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an environment; `sheet` is that of the leaf or `moving_part`, or None."""
+    """Model instances of an environment; `leaf_instance`: of a leaf or `moving_part`, or None."""
 
     instances: Collection[ModelInstanceIndex]
-    sheet: ModelInstanceIndex | None
+    leaf_instance: ModelInstanceIndex | None
 
 
 class ToolContactModel(NamedTuple):
     """Model of the contact between tool and environment.
 
     Attributes:
-        pairs: (k, 28) `ShapePairs.known`; empty if `beyond` is set.
-        watched: (l, 40) `ShapePairs.watched`, pairs that Drake computes at close range.
-        joints: (m, 21) `JointTable` of the boxes in `pairs`.
-        plant_size: size of the plant's state, 0 without joints.
-        beyond: reason for using Drake's contact results instead of the compiled law, or empty.
-        bodies, shapes: indices of the tool's bodies, and identifiers of their collision shapes.
-        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
-        sheet: model instance of the leaf, or of another `moving_part`; None without one.
-        moving: indices of other moving bodies, by name.
+        compiled_pairs: (k, 28) `ShapePairs.compiled_pairs`; empty if `drake_contact_reason` is set.
+        monitored_pairs: (l, 40) `ShapePairs.monitored_pairs`, computed by Drake at close range.
+        joint_table: (m, 21) from `MakeJointTable`, of the boxes in `compiled_pairs`.
+        plant_state_size: size of the plant's state, 0 without joints.
+        drake_contact_reason: why Drake's contact results replace the compiled law, or empty.
+        tool_bodies, tool_shapes: indices of the tool's bodies, identifiers of their shapes.
+        leaf_parameters: (4,) mass [kg], stiffness [N/m], damping [N s/m], gravity [m/s^2].
+        leaf_instance: model instance of the leaf, or of another `moving_part`; None without one.
+        moving_bodies: indices of other moving bodies, by name.
     """
 
-    pairs: NDArray[np.float64]
-    watched: NDArray[np.float64]
-    joints: NDArray[np.float64]
-    plant_size: int
-    beyond: str
-    bodies: frozenset[int]
-    shapes: frozenset[int]
-    leaf: NDArray[np.float64]
-    sheet: ModelInstanceIndex | None
-    moving: dict[str, BodyIndex]
-
-    @property
-    def compiled_law_arguments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return self.pairs, self.joints
+    compiled_pairs: Array
+    monitored_pairs: Array
+    joint_table: Array
+    plant_state_size: int
+    drake_contact_reason: str
+    tool_bodies: frozenset[int]
+    tool_shapes: frozenset[int]
+    leaf_parameters: Array
+    leaf_instance: ModelInstanceIndex | None
+    moving_bodies: dict[str, BodyIndex]
 
 
 def make_empty_contact_model() -> ToolContactModel:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
-    watched = np.zeros((0, NUM_MONITORED_COLUMNS))
-    return ToolContactModel(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
+    monitored_pairs = np.zeros((0, NUM_MONITORED_COLUMNS))
+    return ToolContactModel(
+        pairs, monitored_pairs, joints, 0, "", frozenset(), frozenset(), leaf, None, {}
+    )
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvironment:
-    before, sheet = plant.num_model_instances(), None
+    before, leaf_instance = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
-            sheet = ModelInstanceIndex(plant.num_model_instances())
+            leaf_instance = ModelInstanceIndex(plant.num_model_instances())
         part.AddTo(plant)
     added = range(before, plant.num_model_instances())
-    return AddedEnvironment([ModelInstanceIndex(index) for index in added], sheet)
+    return AddedEnvironment([ModelInstanceIndex(index) for index in added], leaf_instance)
 
 
 def MakeToolContactModel(
@@ -114,22 +112,22 @@ def MakeToolContactModel(
     shapes = ToolShapes(plant, scene_graph, tool)
     contact = make_empty_contact_model()._replace(
         # Integers, because Drake's identifiers would keep the plant alive.
-        bodies=frozenset(int(index) for index in shapes),
-        shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
-        sheet=touched.sheet,
-        moving=MovingBodies(plant, touched),
+        tool_bodies=frozenset(int(index) for index in shapes),
+        tool_shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
+        leaf_instance=touched.leaf_instance,
+        moving_bodies=MovingBodies(plant, touched),
     )
     for part in environment.parts:
         if part.moving_part is not None:
             gravity = plant.gravity_field().gravity_vector()[2]
-            contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
+            contact = contact._replace(leaf_parameters=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    if beyond := _reason_for_drake_contact(environment, contact):
-        return contact._replace(beyond=beyond)
-    joints, order = contact.joints, list[int]()
-    if contact.moving:
-        joints, order = JointTable(plant, contact.moving.values())
+    if reason := _reason_for_drake_contact(environment, contact):
+        return contact._replace(drake_contact_reason=reason)
+    joints, order = contact.joint_table, list[int]()
+    if contact.moving_bodies:
+        joints, order = MakeJointTable(plant, contact.moving_bodies.values())
     from_S = {
         shape: _X_SBody(plant, context, sensor_frame, index)
         for index, own in shapes.items()
@@ -137,14 +135,19 @@ def MakeToolContactModel(
     }
     inspector, slip = scene_graph.model_inspector(), environment.slip
     try:
-        found = ContactPairs(plant, inspector, from_S, touched.instances, slip, order)
+        found = FindContactPairs(plant, inspector, from_S, touched.instances, slip, order)
     except DrakeTeleopError as error:
-        return contact._replace(beyond=str(error))
-    known, watched, unknown = found
-    if not len(known):
-        return contact._replace(beyond=unknown or "no shapes can touch")
+        return contact._replace(drake_contact_reason=str(error))
+    if not len(found.compiled_pairs):
+        reason = found.monitoring_reason or "no shapes can touch"
+        return contact._replace(drake_contact_reason=reason)
     size = plant.num_multibody_states() if len(joints) else 0
-    return contact._replace(pairs=known, watched=watched, joints=joints, plant_size=size)
+    return contact._replace(
+        compiled_pairs=found.compiled_pairs,
+        monitored_pairs=found.monitored_pairs,
+        joint_table=joints,
+        plant_state_size=size,
+    )
 
 
 def _X_SBody(
@@ -156,11 +159,11 @@ def _X_SBody(
 
 
 def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
-    if not contact.moving:
+    if not contact.moving_bodies:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
     if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
-        bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
+        bodies = {name: plant.get_body(index) for name, index in contact.moving_bodies.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
             f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia",
@@ -172,7 +175,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
 def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
     if environment.hydroelastic:
         return "contact is hydroelastic"
-    if contact.sheet is not None and len(environment.parts) > 1:
+    if contact.leaf_instance is not None and len(environment.parts) > 1:
         return "the sheet spring is not the only object"
     return ""
 
@@ -182,21 +185,16 @@ def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, 
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
-        if instance != touched.sheet
+        if instance != touched.leaf_instance
         for index in plant.GetBodyIndices(instance)
     ]
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _name_as_identifier(
-            body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
-        ): (body.index())
+        re.sub(r"\W+", "_", body.name() if names.count(body.name()) == 1 else full): body.index()
         for body in moving
+        for full in [body.scoped_name().get_full()]
     }
-
-
-def _name_as_identifier(name: str) -> str:
-    return re.sub(r"\W+", "_", name)
 
 
 def supports_pose_conversion(joint: Joint) -> bool:
@@ -205,7 +203,7 @@ def supports_pose_conversion(joint: Joint) -> bool:
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
-def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
+def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> Array:
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
@@ -222,7 +220,7 @@ class MovingBodyPose(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
-        self._joints, order = JointTable(plant, [body])
+        self._joints, order = MakeJointTable(plant, [body])
         self._bodies = np.empty((len(order), BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))

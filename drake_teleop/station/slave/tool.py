@@ -23,7 +23,7 @@ from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
-_TOOL_STIFFNESS, _TOOL_DISSIPATION, _TOOL_FRICTION = 4e5, 1.0, 0.2
+_TOOL_STIFFNESS_N_M, _TOOL_DISSIPATION_S_M, _TOOL_FRICTION = 4e5, 1.0, 0.2
 _ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
@@ -59,7 +59,7 @@ class Block:
         return Box(*self.edges)
 
     @property
-    def half_height(self) -> float:
+    def half_extent_along_z(self) -> float:
         """Distance along z_S from the centre to the farthest corner [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
@@ -115,7 +115,7 @@ def end_of_tool_shapes(tool: Tool) -> list[float] | None:
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
-        for half in [each.radius if isinstance(each, Ball) else each.half_height]
+        for half in [each.radius if isinstance(each, Ball) else each.half_extent_along_z]
     ]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
 
@@ -137,7 +137,7 @@ def AddTool(
 def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
     friction = CoulombFriction(_TOOL_FRICTION, _TOOL_FRICTION)
-    AddContactMaterial(surface, _TOOL_DISSIPATION, _TOOL_STIFFNESS, friction)
+    AddContactMaterial(surface, _TOOL_DISSIPATION_S_M, _TOOL_STIFFNESS_N_M, friction)
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)

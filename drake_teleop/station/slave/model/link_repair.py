@@ -5,9 +5,9 @@ from __future__ import annotations
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
@@ -21,7 +21,7 @@ _INERTIA_ENTRIES = {
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
-_MIN_CHANGE_KG_M2 = 1e-15  # changes below this are rounding
+_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
 _TRIANGLE_INEQUALITY_MARGIN = 1e-9
 
@@ -33,7 +33,8 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     values. Return True if a link that joints may move has no inertia.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
-    if inertial is None or inertial.find("mass") is None:
+    mass_element = link.find("inertial/mass")
+    if inertial is None or mass_element is None:
         if is_sdf:
             report.state_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
@@ -42,13 +43,13 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     if name == WORLD_NAME:
         link.remove(inertial)
         return False
-    text = _mass_text(inertial)
+    text = (mass_element.get("value") or mass_element.text or "").strip()
     mass, inertia = parse_number(text), _inertia_tensor_of(inertial, is_sdf=is_sdf)
     fault = ""
-    if not 0.0 <= mass <= MAX_VALUE:
-        fault = f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
-    elif not (np.abs(inertia) <= MAX_VALUE).all():
-        fault = f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
+    if not 0.0 <= mass <= MAX_SI_VALUE:
+        fault = f"mass {text} kg is not between 0 and {MAX_SI_VALUE:g} kg"
+    elif not (np.abs(inertia) <= MAX_SI_VALUE).all():
+        fault = f"an entry of its inertia is no number up to {MAX_SI_VALUE:g} kg m^2"
     no_mass = not fault and mass == 0.0
     if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
@@ -59,7 +60,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     else:
         if no_mass and inertia.any():
             report.state_repair("an inertia without a mass left out of", name)
-        nearest = np.zeros((3, 3)) if no_mass else possible_inertia(inertia, name, report)
+        nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
         link.remove(inertial)
         _write_inertial(
             link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
@@ -67,12 +68,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     return not at_rest and not inertia.any()
 
 
-def _mass_text(inertial: Element) -> str:
-    mass = inertial.find("mass")
-    return "" if mass is None else (mass.get("value") or mass.text or "").strip()
-
-
-def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
+def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
@@ -83,12 +79,10 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64
     return tensor
 
 
-def possible_inertia(
-    inertia: NDArray[np.float64], name: str, report: RepairReport
-) -> NDArray[np.float64]:
+def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _MIN_CHANGE_KG_M2:
+    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _ROUNDING_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
@@ -101,7 +95,7 @@ def _write_inertial(
     link: Element,
     pose: Element | None,
     mass: float,
-    inertia: NDArray[np.float64],
+    inertia: Array,
     *,
     is_sdf: bool,
 ) -> None:
@@ -120,8 +114,8 @@ def _write_inertial(
 
 
 def nearest_possible_inertia(
-    inertia: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+    inertia: Array,
+) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal

@@ -13,8 +13,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
-from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
+from drake_teleop.common.errors import silent_stderr
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
@@ -50,7 +50,7 @@ def remove_unusable_shapes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                fault = _shape_fault(shape) or _mesh_fault(shape, model, files, folder)
+                fault = _shape_fault(shape) or _convert_mesh(shape, model, files, folder)
                 if fault:
                     link.remove(shape)
                     removed.add(fault)
@@ -74,22 +74,22 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
         return f"{kind or 'empty'} shapes cannot be read"
     sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS_OF_SHAPE[kind]
     for name, count in sizes.items():
-        values = _values_in_text(inner.get(name) or inner.findtext(name))
-        if len(values) != count or not all(0.0 < value <= MAX_VALUE for value in values):
+        values = _numbers_in_text(inner.get(name) or inner.findtext(name))
+        if len(values) != count or not all(0.0 < value <= MAX_SI_VALUE for value in values):
             return f"the {name} of a {kind} is no usable size"
-    scale = _values_in_text(inner.get("scale") or inner.findtext("scale"))
+    scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
     places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
     texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
-    numbers = [value for text in texts for value in _values_in_text(text)]
-    valid = all(scale) and all(abs(value) <= MAX_VALUE for value in numbers)
+    numbers = [value for text in texts for value in _numbers_in_text(text)]
+    valid = all(scale) and all(abs(value) <= MAX_SI_VALUE for value in numbers)
     return None if valid else "of an invalid place or scale"
 
 
-def _values_in_text(text: str | None) -> list[float]:
+def _numbers_in_text(text: str | None) -> list[float]:
     return [parse_number(word) for word in (text or "").split()]
 
 
-def _mesh_fault(
+def _convert_mesh(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
     mesh = shape.find("geometry/mesh")
@@ -99,15 +99,8 @@ def _mesh_fault(
     file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
-    if not files.may_read(file):
-        return (
-            f"meshes in {file.resolve().parent} are outside the model's folder and its packages"
-            " (name their folder: --package-path, slave.package_paths)"
-        )
-    try:
-        files.check_file(file)
-    except DrakeTeleopError as error:
-        return str(error)
+    if fault := files.access_fault(file, "meshes"):
+        return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
@@ -157,14 +150,16 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
         parent = joint.parent_body()
         on_world = parent.index() == plant.world_body().index()
         if not isinstance(joint, WeldJoint):
-            _add_stick(plant, joint.frame_on_child(), _pose_in_body(end, body, inboard), body)
+            _add_stick(plant, joint.frame_on_child(), _frame_pose_in_body(end, body, inboard), body)
             end = joint.frame_on_parent()
         elif on_world:
-            _add_stick(plant, body.body_frame(), _pose_in_body(end, body, inboard), body)
+            _add_stick(plant, body.body_frame(), _frame_pose_in_body(end, body, inboard), body)
         body = parent
 
 
-def _pose_in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
+def _frame_pose_in_body(
+    frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]
+) -> RigidTransform:
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

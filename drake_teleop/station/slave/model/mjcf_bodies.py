@@ -7,13 +7,11 @@ from itertools import count
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MAX_VALUE,
     MIN_VECTOR_LENGTH,
     Attributes,
     Mjcf,
@@ -28,6 +26,7 @@ from drake_teleop.station.slave.model.mjcf_masses import (
     primitive_properties,
 )
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
 
 # Elements that generate bodies or joints.
 _GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
@@ -42,7 +41,6 @@ _NUM_SIZES_OF_SHAPE = {
 }  # numbers in size
 _ROUND_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
-_Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)
@@ -51,18 +49,11 @@ class Joint:
 
     name: str
     kind: str
-    anchor: _Array
-    axis: _Array
+    anchor: Array
+    axis: Array
     attributes: Attributes
     limits: tuple[float, float] | None
     ref: float
-
-    def pose(self, q: float) -> RigidTransform:
-        """Return the displacement of the body from its pose in the file to position q [rad, m]."""
-        if self.kind == "slide":
-            return RigidTransform((q - self.ref) * self.axis)
-        turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
-        return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
     def transformed_by(self, X: RigidTransform) -> Joint:
         """Return a copy whose anchor and axis are transformed by X."""
@@ -96,7 +87,7 @@ def takes_part_in_contacts(shape: Attributes) -> bool:
 
 @dataclass(eq=False)
 class Body:
-    """Body with pose X_PB in its parent; `generators` are tags that this package cannot read."""
+    """Body with pose X_PB in its parent; `generator_tags` are tags that are not supported."""
 
     name: str
     X_PB: RigidTransform
@@ -105,7 +96,7 @@ class Body:
     sites: dict[str, RigidTransform] = field(default_factory=dict)
     children: list[Body] = field(default_factory=list)
     inertial: MassProperties | None = None
-    generators: list[str] = field(default_factory=list)
+    generator_tags: list[str] = field(default_factory=list)
     is_auxiliary: bool = False  # a body that the file does not have
 
     def with_descendants(self) -> list[Body]:
@@ -128,7 +119,7 @@ class BodyReader:
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
-    def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
+    def remove_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
         """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
         found = []
 
@@ -189,7 +180,7 @@ class BodyReader:
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
             elif child.tag in _GENERATOR_TAGS:
-                body.generators.append(child.tag)
+                body.generator_tags.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
         name = given.get("name") or self._make_unused_name(f"{body.name}_joint")
@@ -212,7 +203,8 @@ class BodyReader:
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
-        X_FG, size = self._mjcf.read_pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
+        X_FG = self._mjcf.read_pose(given)
+        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_SI_VALUE)
         if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))

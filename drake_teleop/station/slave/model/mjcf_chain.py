@@ -22,9 +22,9 @@ _UNBOUNDED_DYNAMICS_TYPES = (
 )  # dynamics whose output has no range
 
 
-def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
+def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     """Return the world with only the tree of bodies that carries the sensor; report the others."""
-    tops = reader.take_top_bodies()
+    tops = reader.remove_top_bodies()
     kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
     if len(carriers) != 1:
@@ -44,19 +44,20 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     others = [
         top.get("name") or "a body without name" for top, *_ in tops if top not in carriers[0]
     ]
-    for name in (*others, *world.generators):
+    for name in (*others, *world.generator_tags):
         mjcf.report.state_assumption("left out, because the arm does not carry it:", name)
-    world.generators.clear()
+    world.generator_tags.clear()
     arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
-        measured = {site for each in mjcf.elements_in("sensor") if (site := _measured_site(each))}
+        sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
+        measured = {each.get("site", "") for each in sensors}
         arm = _insert_sensor_frame_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
 
 
-def read_world_and_bodies(reader: BodyReader) -> Body:
+def read_whole_world(reader: BodyReader) -> Body:
     return _split_into_one_joint_bodies(reader.read_world())
 
 
@@ -132,11 +133,6 @@ def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
 
 def _names_of_elements(top: Element, tag: str) -> set[str]:
     return {each.get("name", "") for each in top.iter(tag)}
-
-
-def _measured_site(sensor: Element) -> str:
-    is_wrench = sensor.tag in ("force", "torque")
-    return sensor.get("site", "") if is_wrench else ""
 
 
 def _split_into_one_joint_bodies(body: Body) -> Body:

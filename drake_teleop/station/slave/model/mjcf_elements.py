@@ -8,21 +8,21 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _MAX_NESTING_DEPTH = 150  # largest depth of nested elements
 MIN_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
-MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
-_EXTENDABLE_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+_COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
 _ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
 _ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
@@ -51,11 +51,14 @@ class Attributes(dict[str, str]):
             return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
-    def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
+    def vector(self, name: str, default: tuple[float, ...]) -> Array:
         """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
-        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
-            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
+        if (
+            len(self.get(name, "").split()) not in (0, count)
+            or max(map(abs, values)) > MAX_SI_VALUE
+        ):
+            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_SI_VALUE:g}"
             self._report.add_fault(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)
@@ -201,17 +204,17 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _EXTENDABLE_ATTRIBUTES else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _COMPLETED_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 
 
-def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMatrix:
+def _rotation_about_axis(axis: Array, angle: float) -> RotationMatrix:
     length = float(np.linalg.norm(axis))
     return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
 
 
-def smallest_rotation_of_z_to(z: NDArray[np.float64]) -> RotationMatrix:
+def smallest_rotation_of_z_to(z: Array) -> RotationMatrix:
     """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))

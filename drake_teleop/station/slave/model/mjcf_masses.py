@@ -5,21 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
 from drake_teleop.station.slave.model.triangles import convex_hull
-
-_Array = NDArray[np.float64]
 
 
 class MassProperties(NamedTuple):
     """Mass [kg], centre (3,) [m] and inertia (3, 3) about the centre [kg m^2]."""
 
     mass: float
-    centre: _Array
-    inertia: _Array
+    centre: Array
+    inertia: Array
 
     def in_frame(self, X_BG: RigidTransform) -> MassProperties:
         """Return properties that are given in G, in the frame B."""
@@ -41,7 +39,8 @@ def combine_properties(parts: list[MassProperties]) -> MassProperties:
     centre = sum((part.mass * part.centre for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
-        inertia += part.inertia + part.mass * _inertia_of_unit_point(part.centre - centre)
+        p = part.centre - centre
+        inertia += part.inertia + part.mass * (p @ p * np.eye(3) - np.outer(p, p))
     return MassProperties(mass, centre, inertia)
 
 
@@ -118,7 +117,7 @@ def fit_primitive(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransfor
 
 
 def _properties_of_simplices(
-    corners: _Array, weight: _Array, centre: _Array, count: int = 3
+    corners: Array, weight: Array, centre: Array, count: int = 3
 ) -> MassProperties:
     """Return mass properties of m triangles (count 3) or tetrahedra with the centre (count 4)."""
     total = corners.sum(axis=1)
@@ -129,10 +128,6 @@ def _properties_of_simplices(
     return MassProperties(mass, centre, inertia)
 
 
-def _tetrahedron_volumes(corners: _Array, mode: str) -> _Array:
+def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
     volume = np.linalg.det(corners) / 6
     return np.abs(volume) if mode == "legacy" else volume
-
-
-def _inertia_of_unit_point(p: _Array) -> _Array:
-    return np.asarray(p @ p * np.eye(3) - np.outer(p, p))

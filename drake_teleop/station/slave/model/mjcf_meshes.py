@@ -8,7 +8,6 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.triangles import (
     Triangles,
@@ -19,10 +18,6 @@ from drake_teleop.station.slave.model.triangles import (
 )
 
 _NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
-_OUTSIDE_FAULT = (
-    "{kind} files in {folder} are outside the model's folder and its packages"
-    " (name their folder: --package-path, slave.package_paths)"
-)
 _UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 
 
@@ -85,7 +80,7 @@ class MeshLibrary:
         for element in mjcf.elements_in("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
             attributes = mjcf.attributes_of(element, "", label)
-            file, fault = self._load_mesh(element, attributes)
+            file, fault = self._find_mesh_file(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
@@ -101,7 +96,7 @@ class MeshLibrary:
                 self._meshes[name] = mesh = f"{suffix}{_UNREADABLE_FAULT}"
         return mesh
 
-    def _load_mesh(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
+    def _find_mesh_file(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         name = attributes.get("file", "")
         if not name:
             return None, "" if "vertex" in attributes else _UNREADABLE_FAULT
@@ -113,14 +108,7 @@ class MeshLibrary:
         file = self._mjcf.find_file(element, name, folder)
         if file is None:
             return None, _NOT_FOUND_FAULT
-        if self._mjcf.files.may_read(file):
-            try:
-                self._mjcf.files.check_file(file)
-            except DrakeTeleopError as error:
-                self.inaccessible.append(str(error))
-                return None, str(error)
-        else:
-            fault = _OUTSIDE_FAULT.format(kind=element.tag, folder=file.resolve().parent)
+        if fault := self._mjcf.files.access_fault(file, f"{element.tag} files"):
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

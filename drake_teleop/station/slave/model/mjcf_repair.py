@@ -12,14 +12,17 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, possible_inertia
+from drake_teleop.station.slave.model.link_repair import (
+    correct_impossible_inertia,
+    nearest_possible_inertia,
+)
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, takes_part_in_contacts
 from drake_teleop.station.slave.model.mjcf_chain import (
     check_couplings,
     effort_limits,
     hold_joints,
-    read_arm,
-    read_world_and_bodies,
+    read_whole_world,
+    read_world_with_arm,
     report_couplings,
 )
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
@@ -29,7 +32,7 @@ from drake_teleop.station.slave.model.model_references import ModelFiles, read_x
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
-_GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
+_DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 
 
 def repair_mjcf(
@@ -45,21 +48,21 @@ def repair_mjcf(
     if not root.get("model"):
         report.state_assumption("the model is named after its file:", path.stem)
     for option in root.findall("option"):
-        gravity = Attributes(option.attrib, "option", report).vector("gravity", _GRAVITY)
-        if np.abs(np.subtract(gravity, _GRAVITY)).max() > _GRAVITY_TOLERANCE:
+        gravity = Attributes(option.attrib, "option", report).vector("gravity", _DRAKE_GRAVITY_M_S2)
+        if np.abs(np.subtract(gravity, _DRAKE_GRAVITY_M_S2)).max() > _GRAVITY_TOLERANCE_M_S2:
             report.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.in_directives
-    if is_complete or not purpose.sensor:
-        world = read_world_and_bodies(reader)
+    if is_complete or not purpose.sensor_name:
+        world = read_whole_world(reader)
         chain = world.with_descendants() if is_complete else []
     else:
-        world = read_arm(mjcf, reader, purpose.sensor)
-        chain = world.path_to(purpose.sensor)
+        world = read_world_with_arm(mjcf, reader, purpose.sensor_name)
+        chain = world.path_to(purpose.sensor_name)
     if is_complete:
         moving = [(body, joint) for body in chain for joint in body.joints]
         report_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = hold_joints(world, chain, purpose.hold, mjcf)
+        moving = hold_joints(world, chain, purpose.held_positions, mjcf)
         check_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
@@ -67,21 +70,21 @@ def repair_mjcf(
             "left out, because the tool does not carry them: shapes of", "the world"
         )
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
-    _check_bodies(world, report)
+    _check_names_and_generators(world, report)
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _report_lost_shapes(reader, report)
     report.raise_faults(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_faults(path)
-    auxiliary = frozenset(body.name for body in world.with_descendants() if body.is_auxiliary)
-    return RepairedModel(text, report.assumptions, limits, auxiliary=auxiliary)
+    added = frozenset(body.name for body in world.with_descendants() if body.is_auxiliary)
+    return RepairedModel(text, report.assumptions, limits, auxiliary_bodies=added)
 
 
-def _check_bodies(world: Body, report: RepairReport) -> None:
+def _check_names_and_generators(world: Body, report: RepairReport) -> None:
     bodies = world.with_descendants()
     for body in bodies:
-        for tag in body.generators:
+        for tag in body.generator_tags:
             report.add_fault(f"{body.name} contains <{tag}>, which is not supported; expand it")
     for kind, names in (
         ("bodies", [body.name for body in bodies]),
@@ -94,7 +97,7 @@ def _check_bodies(world: Body, report: RepairReport) -> None:
 
 def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
     total = mjcf.compiler.number("settotalmass", -1.0)
-    factor = total / _total_mass_in_file(mjcf) if total > 0.0 else 1.0
+    factor = total / _sum_of_masses_in_file(mjcf) if total > 0.0 else 1.0
 
     def set_masses_below(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
@@ -121,14 +124,14 @@ def _set_mass_of_body(
         return
     properties = properties.with_mass(factor * properties.mass)
     inertia = (
-        possible_inertia(properties.inertia, body.name, report)
+        correct_impossible_inertia(properties.inertia, body.name, report)
         if is_moved
         else nearest_possible_inertia(properties.inertia)[0]
     )
     body.inertial = properties._replace(inertia=inertia)
 
 
-def _total_mass_in_file(mjcf: Mjcf) -> float:
+def _sum_of_masses_in_file(mjcf: Mjcf) -> float:
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
     bodies = reader.read_world().with_descendants()[1:]
     mass = sum(reader.mass_properties(body).mass for body in bodies)

@@ -53,7 +53,7 @@ class MjcfText:
     def _write_content(self, element: Element, body: Body) -> None:
         for joint in body.joints:
             self._write_joint(element, joint)
-        for geom in body.geoms if self._purpose.has_geometry else ():
+        for geom in body.geoms if self._purpose.plant_has_shapes else ():
             if geom.takes_part_in_contacts or geom.is_visible:
                 self._write_geom(element, geom, body)
         for child in body.children:

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-MAX_VALUE = 1e6  # largest length, mass or inertia, SI units; limits may be larger
+MAX_SI_VALUE = 1e6  # largest length, mass or inertia, SI units; limits may be larger
 _NUMBER_LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")
 _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
@@ -47,9 +47,9 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
             value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
-            if not abs(value) <= MAX_VALUE:
+            if not abs(value) <= MAX_SI_VALUE:
                 report.add_fault(
-                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_VALUE:g}"
+                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_SI_VALUE:g}"
                 )
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
                 report.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")

@@ -24,7 +24,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 
 # Limits for all files together (repeated includes count again), and bytes of one text file.
-_MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
+_MAX_FILES, _MAX_TOTAL_BYTES, _MAX_TEXT_BYTES = 2000, 500_000_000, 50_000_000
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _BINARY_SUFFIXES = (
@@ -78,7 +78,7 @@ class ModelFiles:
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
 
-    def merge_packages(self, known: PackageMap) -> None:
+    def add_packages_to_map(self, known: PackageMap) -> None:
         """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
@@ -106,6 +106,19 @@ class ModelFiles:
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
+    def access_fault(self, path: Path, kind: str) -> str:
+        """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
+        if not self.may_read(path):
+            return (
+                f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
+                " (name their folder: --package-path, slave.package_paths)"
+            )
+        try:
+            self.check_file(path)
+        except DrakeTeleopError as error:
+            return str(error)
+        return ""
+
     def check_file(self, path: Path) -> None:
         """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
@@ -115,11 +128,11 @@ class ModelFiles:
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self._sizes.clear()
-            files, size = self._check_and_measure(path, ())
+            files, size = self._count_files_and_bytes(path, ())
         self._total = self._total[0] + files, self._total[1] + size
         _check_num_files_and_size(*self._total, self._model)
 
-    def _check_and_measure(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
+    def _count_files_and_bytes(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read(real):
             raise DrakeTeleopError(
@@ -142,7 +155,7 @@ class ModelFiles:
             files, size = 1, real.stat().st_size
             _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
-                more = self._check_and_measure(named, (*including, real))
+                more = self._count_files_and_bytes(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_num_files_and_size(files, size, path)
             self._sizes[real] = files, size
@@ -208,7 +221,8 @@ def _existing_paths(path: Path | None) -> list[Path]:
 
 
 def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
-    most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY_SUFFIXES else _MAX_TEXT
+    is_text = files == 1 and path.suffix.lower() not in _BINARY_SUFFIXES
+    most = _MAX_TEXT_BYTES if is_text else _MAX_TOTAL_BYTES
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(

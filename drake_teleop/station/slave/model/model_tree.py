@@ -31,11 +31,11 @@ class ModelTree:
 
     Attributes:
         chain: joints from the root to the sensor's link, also fixed ones.
-        moved: for each link the number of moving joints of the chain between root and link.
+        num_joints_to_link: number of moving joints of the chain between the root and each link.
     """
 
     chain: list[Element]
-    moved: dict[str, int]
+    num_joints_to_link: dict[str, int]
 
 
 def link_of_frame(scope: Element, frame: str) -> str:
@@ -66,13 +66,13 @@ def reduce_to_chain(
         return None
     chain = _remove_free_base(scope, chain, report)
     root = joint_end(chain[0], "parent") if chain else sensor_link
-    moved = _remove_unreachable(scope, root, chain, hold, report)
+    num_joints_to_link = _remove_unconnected_links(scope, root, chain, hold, report)
     in_chain = set(map(id, chain))
     for joint in list_joints(scope):
         if id(joint) not in in_chain and joint.get("name") not in hold:
             fix_joint(joint, report)
-    _remove_loops(scope, moved, report)
-    return ModelTree(chain, moved)
+    _remove_loops(scope, num_joints_to_link, report)
+    return ModelTree(chain, num_joints_to_link)
 
 
 def fix_joint(joint: Element, report: RepairReport) -> None:
@@ -122,7 +122,7 @@ def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport
     return chain[moving[0] + 1 :]
 
 
-def _remove_unreachable(
+def _remove_unconnected_links(
     scope: Element, root: str, chain: list[Element], hold: set[str], report: RepairReport
 ) -> dict[str, int]:
     links = {link.get("name", ""): link for link in scope.findall("link")}
@@ -133,33 +133,33 @@ def _remove_unreachable(
     outboard: dict[str, list[Element]] = {}
     for joint in sorted(list_joints(scope), key=lambda joint: id(joint) not in number_of):
         outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
-    moved, ahead, kept = {root: 0}, [root], set[int]()
+    num_joints_to_link, ahead, kept = {root: 0}, [root], set[int]()
     while ahead:
         parent = ahead.pop()
         for joint in outboard.get(parent, []):
             child = joint_end(joint, "child")
             exists = child in links or id(joint) in number_of
-            if exists and child not in moved and child != WORLD_NAME:
-                moved[child] = number_of.get(id(joint), moved[parent])
+            if exists and child not in num_joints_to_link and child != WORLD_NAME:
+                num_joints_to_link[child] = number_of.get(id(joint), num_joints_to_link[parent])
                 kept.add(id(joint))
                 ahead.append(child)
-    for name in links.keys() - moved.keys():
+    for name in links.keys() - num_joints_to_link.keys():
         scope.remove(links[name])
-    for name in [name for name in links if name not in moved and name != WORLD_NAME]:
+    for name in [name for name in links if name not in num_joints_to_link and name != WORLD_NAME]:
         report.state_repair("not connected to the arm and left out:", name or "a link without name")
     for joint in list_joints(scope):
         if id(joint) not in kept:
             scope.remove(joint)
-            if joint_end(joint, "parent") in moved:
+            if joint_end(joint, "parent") in num_joints_to_link:
                 what = "left out, as it closes a loop or has no child:"
                 report.state_repair(what, joint.get("name", ""))
-    return moved
+    return num_joints_to_link
 
 
-def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -> None:
+def _remove_loops(scope: Element, num_joints_to_link: dict[str, int], report: RepairReport) -> None:
     for element in [child for child in scope if child.tag in _LOOP_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
-        groups = {moved.get(link_of_frame(scope, name), -1) for name in names}
+        groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
         if len(names) < _NUM_CONSTRAINT_ENDS or len(groups) > 1:
             report.add_fault(

@@ -18,15 +18,15 @@ class RepairedModel(NamedTuple):
         text: XML for Drake's parser, with absolute mesh paths.
         assumptions: one text per kind of repair, with the names of changed links or joints.
         effort_limits: torque or force limits [N m, N] by joint; joints without an entry have none.
-        dependent: reasons why joints or links do not move independently, by name.
-        auxiliary: names of massless bodies, added between several joints of one body.
+        dependence_reasons: reasons why joints or links do not move independently, by name.
+        auxiliary_bodies: names of massless bodies, added between several joints of one body.
     """
 
     text: str
     assumptions: list[str]
     effort_limits: dict[str, float]
-    dependent: dict[str, str] = {}  # noqa: RUF012  (never changed)
-    auxiliary: frozenset[str] = frozenset()
+    dependence_reasons: dict[str, str] = {}  # noqa: RUF012  (never changed)
+    auxiliary_bodies: frozenset[str] = frozenset()
 
 
 class RepairReport:

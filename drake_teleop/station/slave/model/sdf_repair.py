@@ -11,12 +11,12 @@ from drake_teleop.station.slave.model.model_tree import link_of_frame
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
 from drake_teleop.station.slave.model.urdf_repair import (
     ModelPurpose,
-    finish_repair,
+    convert_meshes_and_write_text,
     repair_links_and_joints,
     repair_urdf,
 )
 
-_MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
+_MODEL_CONFIG_NAME, _URDF_SUFFIX, _SDF_SUFFIX = "model.config", ".urdf", ".sdf"
 _INCLUDE_URI_PATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
 _READABLE_CHILD_TAGS = {
@@ -33,7 +33,7 @@ def repair_sdf(
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
-        _keep_model_with_sensor(root, file, files, purpose.sensor, report)
+        _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
         for element in list(root.iter()):
             allowed = _READABLE_CHILD_TAGS.get(element.tag)
             for child in list(element) if allowed else ():
@@ -47,13 +47,15 @@ def repair_sdf(
         _repair_included(uri, file, files, purpose, folder)
         for uri in root.iterfind(_INCLUDE_URI_PATH)
     ]
-    own = finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
+    own = convert_meshes_and_write_text(
+        root, file, files, report, folder if purpose.plant_has_shapes else None
+    )
     for each in (each for each in inner if each is not None):
         own = RepairedModel(
             own.text,
             own.assumptions + each.assumptions,
             own.effort_limits | each.effort_limits,
-            own.dependent | each.dependent,
+            own.dependence_reasons | each.dependence_reasons,
         )
     return own
 
@@ -72,7 +74,7 @@ def _repair_included(
             " slave.package_paths",
         )
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
-    repair = {_URDF: repair_urdf, _SDF: repair_sdf}.get(included.suffix.lower())
+    repair = {_URDF_SUFFIX: repair_urdf, _SDF_SUFFIX: repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
         return None
     part = purpose._replace(in_directives=True)
@@ -85,8 +87,8 @@ def _repair_included(
 
 def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
     found = files.find_file(address, file.resolve().parent) or files.find_file(address)
-    if found is not None and (found / _MODEL_CONFIG).is_file():
-        named = read_xml(found / _MODEL_CONFIG).findall("sdf")
+    if found is not None and (found / _MODEL_CONFIG_NAME).is_file():
+        named = read_xml(found / _MODEL_CONFIG_NAME).findall("sdf")
         inner = files.find_file((named[0].text or "").strip(), found) if len(named) == 1 else None
         return inner or found
     return found
@@ -123,7 +125,7 @@ def _has_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bo
         inner = [each for each in model.iter() if each.tag == "model"]
         return any(link_of_frame(scope, sensor) for scope in inner)
     included = _included_file((model.findtext("uri") or "").strip(), file, files)
-    if included is None or included.suffix.lower() not in (_URDF, _SDF):
+    if included is None or included.suffix.lower() not in (_URDF_SUFFIX, _SDF_SUFFIX):
         return False
     scopes = [each for each in read_xml(included).iter() if each.tag in ("robot", "model")]
     return any(link_of_frame(scope, sensor) for scope in scopes)

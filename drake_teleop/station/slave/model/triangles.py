@@ -10,17 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
+
 # Triangle of a binary STL file.
 _STL_TRIANGLE_TYPE = np.dtype(
     [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
 )
-_Array = NDArray[np.float64]
 
 
 class Triangles(NamedTuple):
     """Triangle mesh: vertices (n, 3) [m] and rows (m, 3) of vertex indices."""
 
-    vertices: _Array
+    vertices: Array
     faces: NDArray[np.intp]
 
 
@@ -49,7 +50,7 @@ def obj_text(triangles: Triangles) -> str:
     return text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel())
 
 
-def convex_hull(vertices: _Array) -> Triangles:
+def convex_hull(vertices: Array) -> Triangles:
     """Return the convex hull, with triangles that face outwards, or raise ValueError."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -63,7 +64,7 @@ def convex_hull(vertices: _Array) -> Triangles:
     return _merge_vertices(vertices[faces])
 
 
-def _merge_vertices(corners: _Array) -> Triangles:
+def _merge_vertices(corners: Array) -> Triangles:
     points = corners.reshape(-1, 3).astype(float)
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)

@@ -41,20 +41,20 @@ class ModelPurpose(NamedTuple):
     """Use of a model: as arm, tool or surroundings.
 
     Attributes:
-        sensor: frame, link or site of the sensor; empty for tools and surroundings.
-        hold: angles or positions [rad, m] of joints that do not move.
+        sensor_name: frame, link or site of the sensor; empty for tools and surroundings.
+        held_positions: angles or positions [rad, m] of joints that do not move.
         is_tool: whether the model is a tool, whose joints are all fixed.
         is_scene: whether the model is surroundings: all its shapes must be readable.
         in_directives: whether model directives add the model, so that every link is kept.
-        has_geometry: whether the plant has shapes.
+        plant_has_shapes: whether the plant has shapes.
     """
 
-    sensor: str = ""
-    hold: dict[str, float] = {}  # noqa: RUF012  (never changed)
+    sensor_name: str = ""
+    held_positions: dict[str, float] = {}  # noqa: RUF012  (never changed)
     is_tool: bool = False
     is_scene: bool = False
     in_directives: bool = False
-    has_geometry: bool = True
+    plant_has_shapes: bool = True
 
 
 def repair_urdf(
@@ -71,7 +71,9 @@ def repair_urdf(
     repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
         _remove_unused_elements(root, report)
-    return finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
+    return convert_meshes_and_write_text(
+        root, file, files, report, folder if purpose.plant_has_shapes else None
+    )
 
 
 def repair_links_and_joints(
@@ -82,15 +84,15 @@ def repair_links_and_joints(
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _make_names_unique(scope, report)
-    tree = _model_tree_of_scopes(scopes, purpose, report)
+    tree = _reduce_model_to_arm(scopes, purpose, report)
     chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
         for joint in list_joints(scope):
-            if joint.get("name") in purpose.hold:
+            if joint.get("name") in purpose.held_positions:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
-            in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
+            in_chain = id(joint) in chain and joint.get("name") not in purpose.held_positions
             check_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
@@ -99,13 +101,13 @@ def repair_links_and_joints(
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
                 check_quantities(part, f"link {name}", report)
-            at_rest = tree is not None and tree.moved.get(name) == 0
+            at_rest = tree is not None and tree.num_joints_to_link.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
 
 
-def finish_repair(
+def convert_meshes_and_write_text(
     root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
     """Convert meshes and return the text, or raise one DrakeTeleopError about all faults.
@@ -124,10 +126,10 @@ def finish_repair(
     }
     text = ElementTree.tostring(root, encoding="unicode")
     limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
-    return RepairedModel(text, report.assumptions, limits, dependent_joints(root))
+    return RepairedModel(text, report.assumptions, limits, find_dependent_parts(root))
 
 
-def dependent_joints(root: Element) -> dict[str, str]:
+def find_dependent_parts(root: Element) -> dict[str, str]:
     """Return the joints and links that do not move independently, with the reasons."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
@@ -139,7 +141,7 @@ def dependent_joints(root: Element) -> dict[str, str]:
     return found
 
 
-def _model_tree_of_scopes(
+def _reduce_model_to_arm(
     scopes: list[Element], purpose: ModelPurpose, report: RepairReport
 ) -> ModelTree | None:
     if purpose.is_tool:
@@ -148,8 +150,8 @@ def _model_tree_of_scopes(
         return None
     if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
         return None
-    link = link_of_frame(scopes[0], purpose.sensor) if purpose.sensor else ""
-    return reduce_to_chain(scopes[0], link, set(purpose.hold), report) if link else None
+    link = link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
+    return reduce_to_chain(scopes[0], link, set(purpose.held_positions), report) if link else None
 
 
 def _make_names_unique(scope: Element, report: RepairReport) -> None:

@@ -1,0 +1,53 @@
+"""Base class of blocks with one cached step per period."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
+
+from drake_teleop.common.blocks import DoubleOnly, weak_callback
+from drake_teleop.common.numeric import Array
+
+
+class SteppedBlock(DoubleOnly, LeafSystem):
+    """Block whose discrete states advance by a step that outputs and states share."""
+
+    __slots__ = ()
+
+    def _declare_step(self, results: list[Array], num_states: int, period: float) -> Any:
+        """Declare states and the period [s]; return the ticket of the step for output ports.
+
+        `results` are start values of the step's results; the first `num_states` are the states.
+        """
+        self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
+        producer = ValueProducer(
+            allocate=lambda: AbstractValue.Make([np.array(part) for part in results]),
+            calc=weak_callback(self._calc_step),
+        )
+        sources = {self.all_input_ports_ticket(), self.xd_ticket()}
+        step = self.DeclareCacheEntry("step", producer, sources)
+        self._step = step.cache_index()
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        return step.ticket()
+
+    @abstractmethod
+    def _advance(self, context: Context, results: list[Array]) -> None:
+        """Advance the states in `results` by one period, and write the other results."""
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        results = step.get_mutable_value()
+        for state, index in zip(results, self._states, strict=False):
+            state[:] = context.get_discrete_state(index).value()
+        self._advance(context, results)
+
+    def _step_results(self, context: Context) -> list[Array]:
+        results: list[Array] = self.get_cache_entry(self._step).Eval(context)
+        return results
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for state, index in zip(self._step_results(context), self._states, strict=False):
+            discrete_state.set_value(index, state)
