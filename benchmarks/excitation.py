@@ -32,7 +32,12 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import LIMIT_SHARE, Problem, Task, minimise_criterion
+from drake_teleop.lab.excitation.optimizer import (
+    LIMIT_SHARE,
+    DesignProblem,
+    Task,
+    minimise_criterion,
+)
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
@@ -68,7 +73,7 @@ def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dic
     task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
     for seed in range(seeds):
-        found = minimise_criterion(Problem(task), seed=seed, seconds=later)
+        found = minimise_criterion(DesignProblem(task), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
             trajectory, _ = find_best_within_limits(
                 robot, [it for it in found if it.seconds <= seconds]
@@ -86,7 +91,7 @@ class _TimeIsUpError(Exception):
 
 def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -> float:
     """kappa_w10 on the grid after so many seconds of SLSQP without gradients; inf: nothing."""
-    problem = Problem(task_of(robot, "kappa_w10", period))
+    problem = DesignProblem(task_of(robot, "kappa_w10", period))
     rng = np.random.default_rng(seed)
     candidates = [problem.candidate(rng, near_home=k % 2 == 0) for k in range(64)]
     merits = []

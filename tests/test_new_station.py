@@ -19,7 +19,7 @@ from drake_teleop.lab import new_station
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.new_station import new_command, place, plan_station
-from drake_teleop.lab.new_station.place import Place, find_place
+from drake_teleop.lab.new_station.place import StartPlace, find_start_place
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.home import R_WS_HOME
@@ -82,7 +82,7 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
 @pytest.mark.long
 def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
-    found = find_place(arm)
+    found = find_start_place(arm)
     assert found.position[0] > abs(found.position[1]) and found.position[2] > 0.1
     w = R_WS_HOME.ToQuaternion().wxyz()
     for signs in product((-1.0, 1.0), repeat=3):
@@ -90,7 +90,7 @@ def test_place_is_in_front_with_a_reachable_cube():
         assert find_posture(arm, pose, found.q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
     with pytest.raises(DrakeTeleopError, match="no posture found in which z_S points down"):
-        find_place(stiff)
+        find_start_place(stiff)
 
 
 @pytest.mark.long
@@ -105,7 +105,7 @@ def test_rates_match_the_device(tmp_path, runs, device):
 
 
 def test_joint_margin_counts_more_than_cube_size():
-    best = Place(np.zeros(7), True, np.zeros(6), half=0.15, room=0.2)
+    best = StartPlace(np.zeros(7), True, np.zeros(6), half=0.15, room=0.2)
     worse = [
         best._replace(half=0.3, room=0.01),
         best._replace(half=0.3, by_position=False),

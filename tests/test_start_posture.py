@@ -9,7 +9,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_place
+from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_start_place
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
@@ -157,7 +157,7 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain
     assert np.isfinite(drawn).all() and np.abs(drawn).max() <= np.pi
     assert joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
     assert joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(0.5)
-    found = find_place(endless)
+    found = find_start_place(endless)
     assert found.half > 0.0 and np.isfinite(found.q).all()
 
 
@@ -165,9 +165,9 @@ def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
     arm = plain[1].shapes.arm
     tilted = replace(arm, lower=arm.lower * 0.0 - 0.2, upper=arm.upper * 0.0 + 0.2)
     with pytest.raises(DrakeTeleopError, match=r"in 20000 z_S is more than 40 degrees from down"):
-        find_place(tilted)
+        find_start_place(tilted)
     with pytest.raises(DrakeTeleopError, match=r"in \d+ S is too near .*; 0 are left"):
-        find_place(arm, plane=5.0)
+        find_start_place(arm, plane=5.0)
 
 
 def test_frames_and_degrees_of_freedom_follow_the_joints(plain):

@@ -90,7 +90,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     if "force_to_master" in result:
         summary |= _peak_values("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
-        summary |= _detection_figures(result, contact_spans(result.t, contact))
+        summary |= _detection_delays(result, contact_spans(result.t, contact))
     if beyond := _describe_unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
     summary |= _body_displacements(result)
@@ -114,9 +114,7 @@ def draw_overview(result: SimulationResult) -> Figure:
     return figure
 
 
-def _detection_figures(
-    result: SimulationResult, spans: list[tuple[float, float]]
-) -> dict[str, Any]:
+def _detection_delays(result: SimulationResult, spans: list[tuple[float, float]]) -> dict[str, Any]:
     t, summary = result.t, {}
     for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
         flagged = t[result[name][:, 0] > 0]

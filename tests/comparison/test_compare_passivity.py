@@ -30,10 +30,12 @@ pytestmark = pytest.mark.long
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
     monkeypatch.setattr(study, "NETWORK_IMPAIRMENTS", ((0.0, 0.0),))
-    monkeypatch.setattr(study, "LEAF_SPRINGS", {"contact": study.LEAF_SPRINGS["contact"]})
+    monkeypatch.setattr(
+        study, "LEAF_THICKNESSES_M", {"contact": study.LEAF_THICKNESSES_M["contact"]}
+    )
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
-        study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
+        study, "_INJECTED_ENERGY_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
     )
     # Use the load of the shipped scenario, which other tests have identified.
     task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)

@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import brentq
 
 from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin
-from drake_teleop.lab.analysis.one_axis import Axis, OneAxis, servo_response
+from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis, servo_response
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
@@ -176,7 +176,9 @@ def test_longest_round_trip_without_a_method(model, longest):
 
 @pytest.mark.parametrize("model", [OneDof(), REFERENCE])
 def test_simulation_and_linear_analysis_agree(model):
-    shared = {entry.name: getattr(model, entry.name) for entry in dataclasses.fields(Axis)}
+    shared = {
+        entry.name: getattr(model, entry.name) for entry in dataclasses.fields(AxisParameters)
+    }
     axis, fast = OneAxis(**shared, device_damping=DEVICE_DAMPING), 1e5
     margin = float(delay_margin(cut_loop(axis, Sampling(fast, fast, fast))))
     damped = dataclasses.replace(

@@ -26,11 +26,11 @@ from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    empty_motions,
+    allocate_link_motions,
     write_link_motions,
     write_sensor_motion,
 )
-from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.motion_film import write_motion_replay
 from drake_teleop.lab.excitation.optimizer import Iterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -158,7 +158,7 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
         assert film.slow_motion == 1.0
 
     monkeypatch.setattr(ReplayFile, "write", write)
-    write_motion_film(tmp_path / "film.html", short)
+    write_motion_replay(tmp_path / "film.html", short)
     assert np.linalg.norm(frames[1].translation() - frames[0].translation()) > 0.02
 
 
@@ -180,7 +180,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     table, phi = slave.arm.table, slave.limits.phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(t), 3))
     write_sensor_motion(motions, vectors)

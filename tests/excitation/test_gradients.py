@@ -17,16 +17,20 @@ from drake_teleop.lab.excitation.criteria import (
     characteristic_length,
 )
 from drake_teleop.lab.excitation.limits import (
-    CLEARANCE_SCALE_M,
     LIMIT_NAMES,
+    ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
+    allocate_link_motions,
     capsule_distances,
-    empty_motions,
     write_limit_uses,
     write_link_motions,
 )
-from drake_teleop.lab.excitation.optimizer import Problem, Task, _DescentSearch
-from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
+from drake_teleop.lab.excitation.optimizer import DesignProblem, Task, _DescentSearch
+from drake_teleop.lab.excitation.prediction import (
+    SensorNoise,
+    _motion_error_filter,
+    predicted_deviations,
+)
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_filters
@@ -108,7 +112,7 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
     for filter_ in fusion_filters(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _error_filter(filter_, T)
+        numerator, denominator = _motion_error_filter(filter_, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(filter_.gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
@@ -170,7 +174,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     table[sliding, IS_PRISMATIC_COLUMN] = 1.0
     home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
     task = Task(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
-    problem = Problem(task)
+    problem = DesignProblem(task)
     x = problem.candidate(np.random.default_rng(0), near_home=True)
     gradients = problem.evaluate(x, 3.0, 5.0).gradients
     scale = np.abs(gradients).max(axis=1)
@@ -187,7 +191,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
-    motions = empty_motions(30, 6)
+    motions = allocate_link_motions(30, 6)
     write_link_motions(arm.table, q, qd, qdd, motions)
     smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
     write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
@@ -202,7 +206,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
         "velocity": np.abs(qd) / limits.velocity,
         "acceleration": np.abs(qdd) / limits.acceleration,
         "workspace": np.abs(points - limits.box_middle) / limits.box_half,
-        "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE_M,
+        "clearance": 1.0 - (distances - limits.distances) / ZERO_USE_CLEARANCE_MARGIN_M,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
     # A use of 1 is the minimum distance.
@@ -212,7 +216,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
 def test_candidates_cover_the_middle_of_the_range(arm):
     limits, rng = limits_of(arm), np.random.default_rng(1)
     home = np.zeros(6)
-    problem = Problem(Task(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3))
+    problem = DesignProblem(Task(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3))
     starts = np.array([problem.candidate(rng, near_home=False)[:6] for _ in range(50)])
     share = np.abs(starts - limits.q_middle) / limits.q_half
     assert np.all(share <= 0.6) and np.all(share.max(axis=0) > 0.5)
@@ -227,7 +231,7 @@ def test_candidate_size_grows_with_the_square_of_the_period(arm):
     for period in (3.0, 6.0):
         task = Task(arm.table, limits, Criterion("kappa_w10", SCALES), np.zeros(6), period, 3)
         rng = np.random.default_rng(2)
-        coefficients.append(Problem(task).candidate(rng, near_home=True)[6:])
+        coefficients.append(DesignProblem(task).candidate(rng, near_home=True)[6:])
     np.testing.assert_allclose(coefficients[1], 4.0 * coefficients[0], rtol=1e-12)
 
 
@@ -275,6 +279,6 @@ def test_distances_of_capsules():
     )
     rows, radii = np.full(6, -1), np.full(6, 0.1)
     pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [4, 5], [3, 4], [4, 3]])
-    distances = capsule_distances(empty_motions(1, 1), rows, ends, radii, pairs)[0]
+    distances = capsule_distances(allocate_link_motions(1, 1), rows, ends, radii, pairs)[0]
     expected = [0.5, 0.3, 1, 2, 3, np.sqrt(8), np.sqrt(8)]
     np.testing.assert_allclose(distances, np.array(expected) - 0.2, atol=1e-12)

@@ -13,7 +13,7 @@ from drake_teleop.lab.excitation.optimizer import Task
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import (
-    ShortestProblem,
+    ShortestMotionProblem,
     design_shortest_motion,
     sidak_factor,
 )
@@ -32,10 +32,10 @@ def slave() -> Robot:
     return RobotFromScenario(LoadScenario("identification"))
 
 
-def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
+def problem_of(slave: Robot, times: float = 1.0) -> ShortestMotionProblem:
     criterion = Criterion("A16", slave.scales)
     task = Task(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
-    return ShortestProblem(
+    return ShortestMotionProblem(
         task, times * derivatives_over_tolerances(ASKED, slave.limits.phi), slave, None
     )
 
@@ -72,7 +72,7 @@ def test_tolerance_use_follows_from_white_noise_over_the_period(slave: Robot) ->
 def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
+    monkeypatch.setattr(module, "_MAX_ROUNDS_WITHOUT_PROGRESS", 0)
     found = design_shortest_motion(
         slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
     )
@@ -93,6 +93,6 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
 
 
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
+    monkeypatch.setattr(module, "_MAX_ROUNDS_WITHOUT_MOTION", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
         design_shortest_motion(slave, read_tolerance("inertia 0.00001 %"), starts=1)

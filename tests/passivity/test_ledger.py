@@ -123,7 +123,11 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
 
 @pytest.mark.parametrize(("servo", "damping"), [(0.8, 1.2), (1.2, 1.2), (1.2, 0.8)])
 def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
-    imperfect = {"believed_stiffness": servo, "believed_damping": damping, "motor_lag": 3e-3}
+    imperfect = {
+        "configured_stiffness_ratio": servo,
+        "configured_damping_ratio": damping,
+        "motor_lag": 3e-3,
+    }
     for seed in (1, 9):
         assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least_energy_sum(ACTUAL) >= -1e-6
 
@@ -188,7 +192,11 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     """
     rng, t = np.random.default_rng(seed), times(8.0)
     grip = rng.uniform(0.1, 0.4), 8.0, rng.uniform(200.0, 600.0)
-    imperfect = {"believed_stiffness": 1.2, "believed_damping": 1.2, "believed_mass": 1.2}
+    imperfect = {
+        "configured_stiffness_ratio": 1.2,
+        "configured_damping_ratio": 1.2,
+        "configured_mass_ratio": 1.2,
+    }
     run = run_one_dof(
         model(grip, 28.6e3, motor_lag=3e-3, **imperfect), CHARGED_BEFORE,
         NetworkConfig(delay=0.063, jitter=0.44, loss=0.44, burst=0.26), seed=seed, timeout=0.1,

@@ -22,7 +22,7 @@ from drake_teleop.lab.reproduction.experiments import (
     contact_values,
     free_values,
     ideal_values,
-    raw_force_excess,
+    raw_force_beyond_free_range,
     simulate_free_motion,
 )
 from drake_teleop.lab.reproduction.report import (
@@ -235,7 +235,7 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
     figures = contact_values(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
-    assert np.all(raw_force_excess(motion) <= 0)
+    assert np.all(raw_force_beyond_free_range(motion) <= 0)
     assert figures["false_alarm_0_6_s"] is False
     assert figures["duration_s"] == pytest.approx(0.04)
 
@@ -253,7 +253,7 @@ def test_raw_force_detects_contact_by_its_norm(motion):
     free, told = motion.raw_free.copy(), motion.raw.copy()
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.contact, 0] = 80.0
-    excess = raw_force_excess(dataclasses.replace(motion, raw=told, raw_free=free))
+    excess = raw_force_beyond_free_range(dataclasses.replace(motion, raw=told, raw_free=free))
     assert np.all(excess[:3] <= 0)
     assert excess[3] > 0
 

@@ -16,10 +16,10 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     Factorial,
     effects_table,
-    fill_missing,
+    fill_missing_values,
     main_effects,
+    means_and_half_widths_over_seeds,
     pair_means,
-    seed_interval,
 )
 from drake_teleop.lab.studies.level_model import (
     NO_RUN,
@@ -146,7 +146,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
     seen[:2, 1:] = False
     for _ in range(40):
         table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
-        table = fill_missing(np.where(seen, table, np.nan))
+        table = fill_missing_values(np.where(seen, table, np.nan))
         for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
             found, halves = Factorial(levels, [3, 2], which).effects(table)
             into.append(np.abs(found[0]) <= halves[0])
@@ -159,7 +159,7 @@ def test_half_widths_equal_least_squares():
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
-    table = fill_missing(np.where(seen, random.normal(size=(6, 4)), np.nan))
+    table = fill_missing_values(np.where(seen, random.normal(size=(6, 4)), np.nan))
     design = Factorial(levels, [3, 2], seen)
     weights = design.comparable_levels(0)[2]
     weights -= weights.mean(axis=0)
@@ -171,7 +171,10 @@ def test_half_widths_equal_least_squares():
     runs = seen.sum(axis=1)
     spread = np.sum((weights @ solve[:6]) ** 2, axis=1) - weights**2 @ ((runs - 1) / 12)
     expected = stdtrit(freedom, 0.975) ** 2 * variance * spread
-    found = design.means(table, weights)[1] ** 2 - seed_interval(weights @ table)[1] ** 2
+    found = (
+        design.means(table, weights)[1] ** 2
+        - means_and_half_widths_over_seeds(weights @ table)[1] ** 2
+    )
     assert spread.min() > 0
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 

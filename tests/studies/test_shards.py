@@ -43,7 +43,7 @@ def run(out, study=STUDY, function=work, **options):
 @pytest.fixture(autouse=True)
 def parts_of_several_runs(monkeypatch):
     """As in a large study."""
-    monkeypatch.setattr(runs, "_NUM_CHUNKS", 20)
+    monkeypatch.setattr(runs, "_TARGET_NUM_CHUNKS", 20)
 
 
 @pytest.fixture

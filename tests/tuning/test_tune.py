@@ -16,10 +16,10 @@ from drake_teleop.lab.tuning.press_trial import (
     Settings,
     StationTrial,
     press_depth,
-    rms_above,
+    rms_above_frequency,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
-from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
+from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
@@ -29,7 +29,7 @@ GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, 
 
 
 def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
-    stated = stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
+    stated = make_stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
@@ -50,7 +50,7 @@ def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
 )
 def test_invalid_sets_are_refused(arguments, where):
     with pytest.raises(DrakeTeleopError, match=f"^{where}"):
-        stated_set(*arguments)
+        make_stated_set(*arguments)
 
 
 def test_unknown_networks_are_refused():
@@ -73,9 +73,9 @@ def test_firm_grip_presses_less_deeply_with_a_weak_device():
 def test_only_force_above_5_hz_counts_as_oscillation():
     t = np.arange(800) * 1e-3
     slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
-    assert rms_above(slow, 1e-3, 5.0) < 0.05
-    assert rms_above(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-    assert rms_above(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+    assert rms_above_frequency(slow, 1e-3, 5.0) < 0.05
+    assert rms_above_frequency(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above_frequency(np.full(800, np.nan), 1e-3, 5.0) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,9 @@ class FakeStation:
 def trial(walls=(0.5, 20.0)) -> StationTrial:
     given = LoadScenario("contact_transition")
     base = without_task_and_method(given, "internet")
-    return StationTrial(given, base, stated_set(["light", "firm"], walls, "press"), np.ones(16))
+    return StationTrial(
+        given, base, make_stated_set(["light", "firm"], walls, "press"), np.ones(16)
+    )
 
 
 def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
@@ -136,7 +138,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 
 def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
-    stated = stated_set(["light", "firm"], [1.0], "press")
+    stated = make_stated_set(["light", "firm"], [1.0], "press")
     tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0

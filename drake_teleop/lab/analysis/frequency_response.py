@@ -60,11 +60,11 @@ class MultiSine:
                 rotation=list(amplitude * direction[3:]),
             )
             for frequency, amplitude, phase in zip(
-                frequencies, amplitudes, self._phases(), strict=True
+                frequencies, amplitudes, self._phases_with_lowest_peak(), strict=True
             )
         ]
 
-    def _phases(self) -> Array:
+    def _phases_with_lowest_peak(self) -> Array:
         k = self.odd_multiples()
         draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])

@@ -57,14 +57,16 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 # Displacements for differences: errors grow with their square, and with rounding over them.
 _ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
-_MAX_ACCELERATION_RAD_S2 = 20.0  # rad/s^2, requested of a joint: within the motors' torque
-_CONTACT_STEP = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_COMMANDED_ACCELERATION_RAD_S2 = (
+    20.0  # rad/s^2, requested of a joint: within the motors' torque
+)
+_JOINT_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
 _REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
 _MAX_NEWTON_STEPS = 8  # of Newton's method
-_RAMP_S, _SETTLE_S = 0.3, 0.1  # s, motion to the operating point, rest there
+_APPROACH_TIME_S, _REST_TIME_S = 0.3, 0.1  # s, motion to the operating point, rest there
 _MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
+_MAX_EIGENVALUE_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
@@ -131,7 +133,7 @@ class Linearization:
             )
         else:
             values = _find_eigenvalues_near_circle(
-                self._sparse_state_matrix(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
+                self._sparse_state_matrix(size), 2 * np.pi * _MAX_EIGENVALUE_FREQUENCY_HZ * self.dt
             )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
@@ -172,7 +174,7 @@ class Linearization:
 
     @staticmethod
     def _find_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
-        parts = _axis_names(names) if isinstance(names, str) else names
+        parts = _port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
@@ -242,11 +244,18 @@ def linearize(
     D = np.zeros((len(C), B.shape[1]))
     A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
     return Linearization(
-        A, B, C, D, period.dt, names, _axis_names(*_INPUT_PORTS), _axis_names(*_OUTPUT_PORTS)
+        A,
+        B,
+        C,
+        D,
+        period.dt,
+        names,
+        _port_component_names(*_INPUT_PORTS),
+        _port_component_names(*_OUTPUT_PORTS),
     )
 
 
-def _axis_names(*ports: str) -> tuple[str, ...]:
+def _port_component_names(*ports: str) -> tuple[str, ...]:
     return tuple(f"{port}.{axis}" for port in ports for axis in COMPONENT_NAMES)
 
 
@@ -357,10 +366,10 @@ class _PeriodSimulator:
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
-        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_RAD_S2 / gain)
+        self._command_step = min(_ANGLE_STEP, _MAX_COMMANDED_ACCELERATION_RAD_S2 / gain)
         has_contact = smooth.surroundings is not None
         self._joint_step = (
-            min(self._command_step, _CONTACT_STEP) if has_contact else self._command_step
+            min(self._command_step, _JOINT_STEP_IN_CONTACT) if has_contact else self._command_step
         )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
@@ -499,8 +508,8 @@ class _PeriodSimulator:
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
-        ramp = round(_RAMP_S / self.dt) if displacement.any() else 0
-        for k in range(ramp + round(_SETTLE_S / self.dt)):
+        ramp = round(_APPROACH_TIME_S / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_REST_TIME_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)

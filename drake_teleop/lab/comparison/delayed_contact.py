@@ -22,10 +22,10 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-_START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
-_LEAF_LENGTH, _LEAF_WIDTH = 0.12, 0.05  # m
+_START_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+_LEAF_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
 #: Leaves by name: thickness [m], light enough not to oscillate.
-LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
+LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
@@ -49,11 +49,11 @@ def delayed_contact(
     leaf: str | float,
     *,
     task: Task | None = None,
-    depth: float = _PRESS_DEPTH,
+    depth: float = _PRESS_DEPTH_M,
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    `leaf` is a key of `LEAF_SPRINGS` or a stiffness [N/m]; `depth` [m] is the hand's intended
+    `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
     displacement beyond the contact.
     """
     task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
@@ -67,7 +67,7 @@ def delayed_contact(
         rotation=[0.0, 0.05, 0.0],
     )
     scale = base.kinematic_scaling.translation_scale
-    reach = [0.0, 0.0, -(_START_GAP / scale + depth)]
+    reach = [0.0, 0.0, -(_START_GAP_M / scale + depth)]
     press, retreat = (
         MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
         for start, end, translation in (
@@ -77,10 +77,10 @@ def delayed_contact(
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
     sheet = SheetSpring(
-        position=[x, y, z - _START_GAP],
-        length=_LEAF_LENGTH,
-        width=_LEAF_WIDTH,
-        thickness=LEAF_SPRINGS[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
+        position=[x, y, z - _START_GAP_M],
+        length=_LEAF_LENGTH_M,
+        width=_LEAF_WIDTH_M,
+        thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
     return (
         replace(
@@ -97,13 +97,13 @@ def delayed_contact(
 
 def leaf_thickness(stiffness: float) -> float:
     """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
-    unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
+    unit = SheetSpring(length=_LEAF_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
-def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
+def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
     """Return the measures of a run of the task."""
-    heights, turned = _slave_motion(result, scenario)
+    heights, turned = _slave_heights_and_rotations(result, scenario)
     scaling = scenario.force_scaling
     return figures_of_traces(
         t=result.t,
@@ -136,7 +136,7 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
-def _slave_motion(
+def _slave_heights_and_rotations(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     arm = slave_arm(scenario)

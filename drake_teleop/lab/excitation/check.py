@@ -18,9 +18,9 @@ from drake_teleop.load.trajectory import FourierTrajectory
 CHECK_RATE_HZ = 1000.0
 _SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration")
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
-_STEP_S = 1e-4
+_DIFFERENCE_STEP_S = 1e-4
 # Search distance beyond the clearance [m].
-_SEARCH_MARGIN_M = 0.01
+_CLEARANCE_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,13 @@ def check_trajectory(
 ) -> list[LimitUse]:
     """Return the use of every limit in one period of a trajectory, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * CHECK_RATE_HZ) + 1)
-    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
-    qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
+    before, q, after = (
+        trajectory.evaluate(t + step)[0] for step in (-_DIFFERENCE_STEP_S, 0.0, _DIFFERENCE_STEP_S)
+    )
+    qd, qdd = (
+        (after - before) / (2 * _DIFFERENCE_STEP_S),
+        (after - 2 * q + before) / _DIFFERENCE_STEP_S**2,
+    )
     return check_motion(robot, t, q, qd, qdd, progress)
 
 
@@ -87,7 +92,7 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 
 @dataclass(frozen=True)
-class _MotionSamples:
+class _MotionLimitSignals:
     torque: Array
     sensor: Array
     workspace: Array
@@ -97,7 +102,7 @@ class _MotionSamples:
 
 def _evaluate_motion(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
-) -> _MotionSamples:
+) -> _MotionLimitSignals:
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
@@ -128,14 +133,16 @@ def _evaluate_motion(
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = robot.scene_graph.get_query_output_port().Eval(scene_context)
-        distance, words = _nearest_obstacle(robot, query, limits.clearance + _SEARCH_MARGIN_M)
+        distance, words = _nearest_shape_pair(
+            robot, query, limits.clearance + _CLEARANCE_SEARCH_MARGIN_M
+        )
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
             progress(k / len(q))
     progress(1.0)
     sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
-    return _MotionSamples(torque, sensor, workspace, clearance, nearest)
+    return _MotionLimitSignals(torque, sensor, workspace, clearance, nearest)
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
@@ -154,7 +161,7 @@ def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     return found[1:]
 
 
-def _nearest_obstacle(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
+def _nearest_shape_pair(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"

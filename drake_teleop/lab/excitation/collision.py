@@ -38,7 +38,11 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
+from drake_teleop.lab.excitation.limits import (
+    allocate_link_motions,
+    capsule_distances,
+    write_link_motions,
+)
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_plant
@@ -112,20 +116,20 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
-_NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
+_NEIGHBOUR_SHARE, _MIN_DISTANCE_VARIATION_M = 0.95, 1e-3
 # Number of postures that show which shapes remain at a constant distance.
-_NUM_FIRST_POSTURES = 20
+_NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
-_CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
+_NEAR_CONTACT_DISTANCES_M, _CAPSULE_EXCESS_QUANTILE, _MAX_BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
 # Smallest number of postures near contact for a correction.
-_MIN_POSTURES = 5
+_MIN_NEAR_CONTACT_POSTURES = 5
 # Share of postures below which near capsules count although their shapes were never near.
-_RARE_SHARE = 0.05
+_RARE_NEARNESS_SHARE = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
-_PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_HALF_SPACE_BOX, _HALF_SPACE_BOX_POSE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
 _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
@@ -134,7 +138,7 @@ _ShapePair = tuple[GeometryId, GeometryId]
 ParseArm = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
 
 
-class Scene:
+class CollisionScene:
     """Plant and scene graph of the arm with its heaviest load.
 
     Args:
@@ -149,15 +153,15 @@ class Scene:
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
-        _add_solid_shapes(self.plant, self.scene_graph, visuals_count)
+        _complete_collision_shapes(self.plant, self.scene_graph, visuals_count)
         _check_shape_sizes(self.plant, self.scene_graph, where)
         _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE_NAME)
         finalize_plant(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
-        self._rows = self._find_link_rows()
+        self._rows = self._find_link_row_of_bodies()
 
-    def _find_link_rows(self) -> dict[BodyIndex, int]:
+    def _find_link_row_of_bodies(self) -> dict[BodyIndex, int]:
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -192,17 +196,19 @@ class Scene:
             q[self.arm.position_index] = posture
             self.plant.SetPositions(plant_context, q)
             query = self.scene_graph.get_query_output_port().Eval(scene_context)
-            for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(
+                _NEAR_CONTACT_DISTANCES_M[1]
+            ):
                 distances[found.id_A, found.id_B][k] = found.distance
-            if k + 1 == _NUM_FIRST_POSTURES:
+            if k + 1 == _NUM_COAXIALITY_POSTURES:
                 in_context = self.scene_graph.collision_filter_manager(scene_context)
-                _exclude_coaxial(in_context, distances)
+                _exclude_coaxial_pairs(in_context, distances)
         # A new manager: declarations of a manager older than the context have no effect there.
         manager = self.scene_graph.collision_filter_manager()
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
-            constant = of_pair.max() < of_pair.min() + _MIN_VARIATION_M
+            constant = of_pair.max() < of_pair.min() + _MIN_DISTANCE_VARIATION_M
             neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_SHARE
             touch = start is not None and of_all[-1] < CLEARANCE_M
             if touch and not neighbours:
@@ -223,7 +229,7 @@ class Scene:
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
         """Return links, ends, radii, pairs and minimum distances of capsules around the shapes."""
         inspector = self.scene_graph.model_inspector()
-        motions = empty_motions(1, self.arm.num_joints)
+        motions = allocate_link_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
@@ -235,12 +241,12 @@ class Scene:
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
-            X_LB = X_WB if row < 0 else _transform_of_motion(motions[0, row]).InvertAndCompose(X_WB)
+            X_LB = X_WB if row < 0 else _pose_of_link_motion(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
-        outer = {shape: _outermost_capsule(shape, capsules) for shape in capsules}
+        outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
         outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
@@ -251,43 +257,55 @@ class Scene:
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         shapes = [capsules[shape][1] for shape in outer_shapes]
-        motions = empty_motions(len(postures), self.arm.num_joints)
+        motions = allocate_link_motions(len(postures), self.arm.num_joints)
         write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _minimum_distance(shape_distances[a, b], capsules_apart[:, k])
+            distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
             near = shape_distances[a, b] < CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
-            if near.sum() >= _MIN_POSTURES:
+            if near.sum() >= _MIN_NEAR_CONTACT_POSTURES:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_SHARE
+                useful = (
+                    near.any()
+                    or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_NEARNESS_SHARE
+                )
             if useful:
                 used.append(k)
                 distances.append(distance)
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _required_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
+    touching = (of_shapes > _NEAR_CONTACT_DISTANCES_M[0]) & (
+        of_shapes < _NEAR_CONTACT_DISTANCES_M[1]
+    )
     excess = (
-        (of_shapes - capsules_apart)[touching] if touching.sum() >= _MIN_POSTURES else np.zeros(1)
+        (of_shapes - capsules_apart)[touching]
+        if touching.sum() >= _MIN_NEAR_CONTACT_POSTURES
+        else np.zeros(1)
     )
     free = capsules_apart[of_shapes > CLEARANCE_M]
     return float(
-        min(CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
+        min(
+            CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
+            np.quantile(free, _MAX_BLOCKED_SHARE),
+        )
     )
 
 
-def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_ShapePair, Array]) -> None:
+def _exclude_coaxial_pairs(
+    manager: CollisionFilterManager, distances: dict[_ShapePair, Array]
+) -> None:
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
-        first = of_pair[:_NUM_FIRST_POSTURES]
-        if first.max() < min(CLEARANCE_M, first.min() + _MIN_VARIATION_M):
+        first = of_pair[:_NUM_COAXIALITY_POSTURES]
+        if first.max() < min(CLEARANCE_M, first.min() + _MIN_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
@@ -297,7 +315,7 @@ def _identifier_number(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
-def _outermost_capsule(
+def _shape_with_enclosing_capsule(
     shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
 ) -> GeometryId:
     row, capsule = capsules[shape]
@@ -309,7 +327,7 @@ def _outermost_capsule(
     return max(holding, key=lambda entry: entry[:2])[2]
 
 
-def _transform_of_motion(motion: Array) -> RigidTransform:
+def _pose_of_link_motion(motion: Array) -> RigidTransform:
     return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 
@@ -326,7 +344,9 @@ def _add_load(
     )
 
 
-def _add_solid_shapes(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
+def _complete_collision_shapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool
+) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
@@ -364,5 +384,5 @@ def _add_shape(
     plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
 ) -> None:
     if isinstance(shape, HalfSpace):
-        X_BG, shape = X_BG @ _X_PLANE_PLATE, _PLATE
+        X_BG, shape = X_BG @ _HALF_SPACE_BOX_POSE, _HALF_SPACE_BOX
     plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())

@@ -23,12 +23,16 @@ from drake_teleop.load.regressor import regressor
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
 #: Sample rate of A16 and D16 [Hz].
-SAMPLE_RATE_HZ = 1000.0
+CRITERION_SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
 # [N], [N m].
-_MASS_ERROR, _COM_ERROR_M, _INERTIA_ERROR = 0.01, 1e-3, 0.1
-_OFFSET_ERRORS = (0.1, 0.005)
+_ACCEPTABLE_RELATIVE_MASS_ERROR, _ACCEPTABLE_COM_ERROR_M, _ACCEPTABLE_RELATIVE_INERTIA_ERROR = (
+    0.01,
+    1e-3,
+    0.1,
+)
+_ACCEPTABLE_OFFSET_ERRORS_N_NM = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
 _MIN_EIGENVALUE_RATIO = 1e-13
 
@@ -92,7 +96,7 @@ class Criterion:
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(SAMPLE_RATE_HZ * duration))
+        return float(np.exp(log_value) / np.sqrt(CRITERION_SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
@@ -121,13 +125,13 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, top_weights = _smooth_max(logs, sharpness)
-        bottom, bottom_weights = _smooth_max(-logs, sharpness)
+        top, top_weights = _smooth_maximum_and_weights(logs, sharpness)
+        bottom, bottom_weights = _smooth_maximum_and_weights(-logs, sharpness)
         return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
 @njit(cache=True)
-def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
+def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
     """Write gradients (3,) of a scalar by s, omega, alpha, from that by the regressor V (6, 10)."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
@@ -149,12 +153,19 @@ def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
 
 
 def _acceptable_errors(phi: Array) -> Array:
-    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_OFFSET_ERRORS, 3)
-    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
+    inertia = _ACCEPTABLE_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_ACCEPTABLE_OFFSET_ERRORS_N_NM, 3)
+    return np.array(
+        [
+            *offsets,
+            _ACCEPTABLE_RELATIVE_MASS_ERROR * phi[0],
+            *3 * [_ACCEPTABLE_COM_ERROR_M * phi[0]],
+            *6 * [inertia],
+        ]
+    )
 
 
-def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:
+def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()

@@ -15,12 +15,12 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_tra
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    empty_motions,
+    allocate_link_motions,
     write_limit_uses,
     write_link_motions,
     write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, minimise_criterion
+from drake_teleop.lab.excitation.optimizer import DesignProblem, Iterate, Task, minimise_criterion
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -28,9 +28,9 @@ from drake_teleop.load.trajectory import FourierTrajectory
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
-_CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
+_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKS = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
-_SMALL_FACTORS, _NUM_SMALL = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
+_FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
 _CONVEX_HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
     " touch in its start posture are ignored"
@@ -88,17 +88,17 @@ def excite(
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        problem = Problem(task)
+        problem = DesignProblem(task)
         found = minimise_criterion(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
         small = _shrinking_motions_at_start(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
-    return make_checked_excitation(robot, criterion, found, trajectory, uses)
+    return assemble_excitation(robot, criterion, found, trajectory, uses)
 
 
-def make_checked_excitation(
+def assemble_excitation(
     robot: Robot,
     criterion: str,
     found: list[Iterate],
@@ -159,7 +159,7 @@ def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, f
 def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
     write_sensor_motion(motions, out)
@@ -172,7 +172,7 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
     checks = 0
     for iterate in ranked:
-        if iterate.value < _CANDIDATE_RATIO * last[iterate.start]:
+        if iterate.value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start]:
             continue
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
@@ -186,14 +186,14 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
 
 
 def _shrinking_motions_at_start(
-    robot: Robot, found: list[Iterate], problem: Problem, seed: int
+    robot: Robot, found: list[Iterate], problem: DesignProblem, seed: int
 ) -> Iterator[FourierTrajectory]:
-    best = sorted(found, key=lambda iterate: iterate.value)[:_NUM_SMALL]
+    best = sorted(found, key=lambda iterate: iterate.value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
     rng = np.random.default_rng(seed)
-    random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_SMALL))
+    random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_FALLBACK_MOTIONS))
     motions += [problem.trajectory(x) for x in random]
-    for factor in _SMALL_FACTORS:
+    for factor in _FALLBACK_AMPLITUDE_FACTORS:
         for motion in motions:
             small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
             # The last use is that of capsules; `check_trajectory` measures the true clearance.
@@ -203,7 +203,7 @@ def _shrinking_motions_at_start(
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMIT_NAMES)))
     gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.criteria import regressor_gradient
+from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,
     add_point_to_seed,
@@ -26,7 +26,7 @@ from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, inverse_dynamics, l
 LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
-CLEARANCE_SCALE_M = 0.1
+ZERO_USE_CLEARANCE_MARGIN_M = 0.1
 # Smallest weight in the gradient of a smooth maximum.
 _MIN_GRADIENT_WEIGHT = 1e-7
 # Value that replaces all distances above clearance plus scale [m].
@@ -69,7 +69,7 @@ class Limits(NamedTuple):
     clearance: float
 
 
-def half_ranges_for_sampling(q_half: Array) -> Array:
+def finite_half_ranges(q_half: Array) -> Array:
     """Return the half ranges (n,) for random postures [rad]: pi without limits."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
@@ -101,7 +101,7 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
     for t in range(len(motions)):
         motion = motions[t, -1]
         omega = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
-        regressor_gradient(omega, g_V[t], g[0], g[1], g[2])
+        write_gradients_by_motion(omega, g_V[t], g[0], g[1], g[2])
         seeds[-1] = 0.0
         for k in range(3):
             add_vector_to_seed(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
@@ -188,11 +188,11 @@ def _write_torque_use(
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
         add_torque_to_seeds(table, motions[t], c, virtual, seeds)
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
+def _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
     pull_back_seeds(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
@@ -232,7 +232,7 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
         add_wrench_to_seed(motion, limits.phi, force, torque, seeds[-1])
         add_vector_to_seed(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
         add_vector_to_seed(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -263,7 +263,7 @@ def _write_workspace_use(
                 use[t, i + 2] * sign[t, i + 2],
             )
             add_point_to_seed(motions[t, -1], limits.points_S[k], g, seeds[-1])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -283,9 +283,9 @@ def _write_clearance_use(
             a, b = limits.pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
             distance = _FAR_DISTANCE_M
-            if not _is_farther_apart(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE_M):
+            if not _is_farther_apart(ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M):
                 distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
-            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE_M
+            use[t, k] = 1.0 - (distance - limits.distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
     largest[6], smooth[6] = _smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_GRADIENT_WEIGHT:
@@ -302,13 +302,13 @@ def _write_clearance_use(
                 if row < 0:
                     continue
                 along, towards = nearest[side], (1.0 if side == 0 else -1.0)
-                factor = -use[t, k] / CLEARANCE_SCALE_M * towards
+                factor = -use[t, k] / ZERO_USE_CLEARANCE_MARGIN_M * towards
                 point = limits.capsule_ends[capsule, 0] + along * (
                     limits.capsule_ends[capsule, 1] - limits.capsule_ends[capsule, 0]
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 add_point_to_seed(motions[t, row], point, g, seeds[row])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -385,5 +385,5 @@ def _segment_distance(first, second, nearest):
     return distance
 
 
-def empty_motions(samples: int, joints: int) -> Array:
+def allocate_link_motions(samples: int, joints: int) -> Array:
     return np.empty((samples, joints + 1, FRAME_STATE_SIZE))

@@ -17,9 +17,9 @@ from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     Limits,
+    allocate_link_motions,
     criterion_gradient,
-    empty_motions,
-    half_ranges_for_sampling,
+    finite_half_ranges,
     write_limit_uses,
     write_link_motions,
     write_sensor_motion,
@@ -71,7 +71,7 @@ class Evaluation:
     largest_use: float
 
 
-class Problem:
+class DesignProblem:
     """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
 
     def __init__(self, task: Task) -> None:
@@ -84,7 +84,7 @@ class Problem:
         )
         #: (3, T, free): q, qd, qdd of unit coefficients.
         self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period / samples))
-        self._motions = empty_motions(samples, n)
+        self._motions = allocate_link_motions(samples, n)
         self._vectors = np.empty((3, samples, 3))
         self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
 
@@ -103,7 +103,7 @@ class Problem:
         )
         q0 = task.home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
-            half = half_ranges_for_sampling(limits.q_half)
+            half = finite_half_ranges(limits.q_half)
             q0 = limits.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
@@ -152,7 +152,7 @@ LIMIT_SHARE = 0.985
 _MAX_FEASIBLE_USE = 0.9885
 
 # Number of candidates in a batch, and number of them from which a descent starts.
-_NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
+_NUM_CANDIDATES, _NUM_DESCENT_STARTS = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
@@ -177,7 +177,7 @@ class Iterate:
 
 
 def minimise_criterion(
-    problem: Problem,
+    problem: DesignProblem,
     *,
     seed: int,
     starts: int = 4,
@@ -208,7 +208,7 @@ class _InfeasibleStartError(Exception): ...
 class _DescentSearch:
     def __init__(
         self,
-        problem: Problem,
+        problem: DesignProblem,
         starts: int,
         seconds: float | None,
         progress: Callable[[float, float], None],
@@ -239,7 +239,7 @@ class _DescentSearch:
                 self._count_evaluation()
                 point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
                 merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
-            for k in np.argsort(merit)[:_NUM_FOLLOWED]:
+            for k in np.argsort(merit)[:_NUM_DESCENT_STARTS]:
                 yield batch[k]
 
     def descend_from(self, x: Array) -> None:

@@ -51,7 +51,7 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = fusion_filters(estimation, sensor, num_joints, period)
-        filters = _error_filter(linear, period), _error_filter(angular, period)
+        filters = _motion_error_filter(linear, period), _motion_error_filter(angular, period)
     place = sensor.accelerometer()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -76,7 +76,7 @@ def predicted_covariance(
     influence[:, :6] = weighted @ inverse
     if noise.filters is not None:
         of_s, of_alpha = noise.filters
-        of_motion = -spatial_inertia(phi) @ influence[:, :6]
+        of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
         through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
@@ -93,7 +93,7 @@ def _covariance_of_influence(influence: Array, variances: Array) -> Array:
     return rows.T @ rows
 
 
-def _error_filter(filter_: SteadyStateFilter, period: float) -> tuple[Array, Array]:
+def _motion_error_filter(filter_: SteadyStateFilter, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(filter_.gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
@@ -107,7 +107,7 @@ def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: fl
     return np.asarray(lfilter(b, a, signals[::-1], axis=0)[::-1])
 
 
-def spatial_inertia(phi: Array) -> Array:
+def spatial_inertia_matrix(phi: Array) -> Array:
     """Return the matrix (6, 6) from [s, alpha] of the sensor to the wrench of a load phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])

@@ -15,9 +15,9 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import CLEARANCE_M, ParseArm, Scene
+from drake_teleop.lab.excitation.collision import CLEARANCE_M, CollisionScene, ParseArm
 from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
-from drake_teleop.lab.excitation.limits import Limits, half_ranges_for_sampling
+from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
@@ -30,13 +30,13 @@ from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_POSTURES = 1000  # random postures for distances of shapes
+_NUM_RANDOM_POSTURES = 1000  # random postures for distances of shapes
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_LOAD_FACTOR = 1.3
+_HEAVIEST_LOAD_RATIO = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _PAYLOAD_COM_M, _PAYLOAD_GYRATION_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
@@ -86,7 +86,9 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
     own = scenario.slave.model != ""
-    scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
+    scene = CollisionScene(
+        parse, (_HEAVIEST_LOAD_RATIO - 1) * slave.arm.phi_load, visuals_count=not own
+    )
     scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
@@ -133,7 +135,7 @@ def RobotFromModel(
     check_size(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_LOAD_FACTOR - 1) * load
+        reserve = (_HEAVIEST_LOAD_RATIO - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -150,9 +152,9 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the total mass beyond the sensor, or remove the option",
             )
-        reserve = _make_compact_load(mass - load[0])
+        reserve = _phi_of_compact_load(mass - load[0])
     with translate_drake_errors(path):
-        scene = Scene(parse, reserve, visuals_count=False, where=str(path))
+        scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
     scene.arm, completed = with_all_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
@@ -172,7 +174,7 @@ def RobotFromModel(
 
 
 def _make_robot(
-    scene: Scene,
+    scene: CollisionScene,
     name: str,
     sensor: WristSensorConfig,
     estimation: MotionEstimationConfig,
@@ -186,8 +188,8 @@ def _make_robot(
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
-    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
-    postures = middle + half_ranges_for_sampling(half) * random
+    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_RANDOM_POSTURES, len(half)))
+    postures = middle + finite_half_ranges(half) * random
     candidates, touching = scene.find_collision_candidates(postures, start)
     if touching:
         assumptions.append(
@@ -239,6 +241,6 @@ def _read_arm(parse: ParseArm) -> ArmModel:
     return ArmModelFromPlant(plant, instance, frame.name())
 
 
-def _make_compact_load(mass: float) -> Array:
+def _phi_of_compact_load(mass: float) -> Array:
     com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
     return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

@@ -22,8 +22,8 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import (
     Excitation,
+    assemble_excitation,
     find_best_within_limits,
-    make_checked_excitation,
     sensor_motion,
 )
 from drake_teleop.lab.excitation.limits import (
@@ -35,15 +35,15 @@ from drake_teleop.lab.excitation.limits import (
 )
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
+    DesignProblem,
     Evaluation,
-    Problem,
     Task,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
-    spatial_inertia,
+    spatial_inertia_matrix,
 )
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
@@ -62,11 +62,16 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 _MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor;
 # additional margin after a round that missed the tolerance.
-_MAX_ROUNDS, _MAX_VAIN_ROUNDS, _PROGRESS_RATIO, _FACTOR_MARGIN = 20, 1, 0.99, 1.005
+_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO, _FACTOR_MARGIN_AFTER_MISS = (
+    20,
+    1,
+    0.99,
+    1.005,
+)
 # Number of rounds without any motion before the search fails.
-_MAX_EMPTY_ROUNDS = 3
+_MAX_ROUNDS_WITHOUT_MOTION = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.
-_MAX_START_MISFIT, _NUM_LATER_STARTS = 1.5, 4
+_MAX_MISFIT_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 # Difference between the seeds of rounds.
 _SEED_STEP = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
@@ -110,14 +115,14 @@ def design_shortest_motion(
     best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_ROUNDS):
-        problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
+        problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
+        num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = minimise_criterion(
             problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.value <= _MAX_PERIOD_S]
         if not found:
-            if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
+            if (empty_rounds := empty_rounds + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
                 break
             around = None
             continue
@@ -126,22 +131,24 @@ def design_shortest_motion(
         covariance = predicted_covariance(*motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi)
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _MAX_START_MISFIT else None
+        around = problem.best if worst < _MAX_MISFIT_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
             vain_rounds = (
                 0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
-                excitation = make_checked_excitation(robot, "period", found, trajectory, uses)
+                excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
-            if vain_rounds == _MAX_VAIN_ROUNDS:
+            if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
         new_factor = factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         factor = (
-            _FACTOR_MARGIN * np.maximum(new_factor, factor) if worst > 1.0 and k > 0 else new_factor
+            _FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
+            if worst > 1.0 and k > 0
+            else new_factor
         )
     if best is not None:
         return best
@@ -158,7 +165,7 @@ def sidak_factor(count: int) -> float:
     return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
 
-class ShortestProblem(Problem):
+class ShortestMotionProblem(DesignProblem):
     """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
@@ -175,7 +182,7 @@ class ShortestProblem(Problem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise_densities(robot.noise, robot.limits.phi)
+        self._noise = relative_white_noise_densities(robot.noise, robot.limits.phi)
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
@@ -254,9 +261,9 @@ class ShortestProblem(Problem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(self._variances(self._regression_rows(*motion), period)[0])
+        return np.sqrt(self._variances(self._weighted_regressor_rows(*motion), period)[0])
 
-    def _regression_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
+    def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
@@ -276,7 +283,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        rows = self._regression_rows(*self._vectors)
+        rows = self._weighted_regressor_rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
@@ -288,13 +295,13 @@ class ShortestProblem(Problem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
+def relative_white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)
         at_So[:3, 3:] = cross_matrix(noise.place)
-        through = spatial_inertia(phi) @ at_So
+        through = spatial_inertia_matrix(phi) @ at_So
         density = density + through @ np.diag(noise.white[6:]) @ through.T
     roots = np.sqrt(noise.white[:6])
     return density / np.outer(roots, roots)

@@ -14,7 +14,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file, write_picture
 from drake_teleop.lab.new_station.picture import draw_start
-from drake_teleop.lab.new_station.plan import Plan, plan_station
+from drake_teleop.lab.new_station.plan import StationPlan, plan_station
 from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
@@ -97,7 +97,7 @@ def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _print_plan(plan: Plan, scenario: Path, picture: Path) -> None:
+def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

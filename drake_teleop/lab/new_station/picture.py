@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.new_station.plan import Plan
+from drake_teleop.lab.new_station.plan import StationPlan
 from drake_teleop.lab.new_station.random_postures import postures_at
 from drake_teleop.lab.new_station.text import wall_of_plan
 from drake_teleop.station.slave.posture_shapes import PostureShapes
@@ -28,19 +28,19 @@ _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from t
 _WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _TRIAD_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
-_SPIRAL_STEPS = np.arange(0.5, 250.0)
-_SAMPLED_DIRECTIONS = np.column_stack(
+_SPIRAL_INDICES = np.arange(0.5, 250.0)
+_HULL_SAMPLE_DIRECTIONS = np.column_stack(
     [
-        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
-        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
-        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
-        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
-        1.0 - _SPIRAL_STEPS / 125.0,
+        np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
+        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES),
+        np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
+        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES),
+        1.0 - _SPIRAL_INDICES / 125.0,
     ]
 )
 
 
-def draw_start(plan: Plan, title: str) -> Figure:
+def draw_start(plan: StationPlan, title: str) -> Figure:
     """Draw the shapes in the start posture; meshes as convex hulls."""
     shapes, wall = plan.shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
@@ -69,7 +69,7 @@ def draw_start(plan: Plan, title: str) -> Figure:
     return figure
 
 
-def _caption(plan: Plan) -> str:
+def _caption(plan: StationPlan) -> str:
     gap = 1e3 * (plan.lowest[2] - wall_of_plan(plan).position[2])
     plane = round(plan.plane, 2) + 0.0  # not -0
     return (
@@ -97,8 +97,8 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
 
 
 def _hull_triangles(points: Array) -> Array:
-    if len(points) > len(_SAMPLED_DIRECTIONS):
-        points = points[np.unique((points @ _SAMPLED_DIRECTIONS.T).argmax(axis=0))]
+    if len(points) > len(_HULL_SAMPLE_DIRECTIONS):
+        points = points[np.unique((points @ _HULL_SAMPLE_DIRECTIONS.T).argmax(axis=0))]
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -143,7 +143,7 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
 
 
-def _joint_chain_points(plan: Plan) -> Array:
+def _joint_chain_points(plan: StationPlan) -> Array:
     at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
     return np.vstack([at_start.origins[0], at_start.p_WS])
 

@@ -22,18 +22,22 @@ NUM_POSTURES = 20_000
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
 # Distance of S from the vertical line through the first joint, and its height above that joint, in
 # units of the reach.
-_RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.8)
+_RADIUS_RANGE_OVER_REACH, _HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
-_PREFERRED_RADIUS, _PREFERRED_HEIGHT, _LOWEST_PREFERRED_HEIGHT = 0.6, 0.25, -0.4
-_MAX_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
+(
+    _PREFERRED_RADIUS_OVER_REACH,
+    _PREFERRED_TOOL_HEIGHT_OVER_REACH,
+    _MIN_PREFERRED_HEIGHT_OVER_REACH,
+) = 0.6, 0.25, -0.4
+_MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
-_SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 2.0
+_SIDE_HALF_WIDTH_RAD, _NUM_SIDES, _FRONT_SIDE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _ROUNDING_TOLERANCE = 1e-9  # singular values that are 0, over the largest
 _NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
-_GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
+_SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +63,7 @@ class Postures:
 
 
 @dataclass(frozen=True)
-class Region:
+class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
@@ -83,10 +87,10 @@ class Region:
     @property
     def preferred(self) -> Array:
         """Preferred position p_WS (3,) of the sensor [m]."""
-        r, height = _PREFERRED_RADIUS * self.reach, self.plane + self.tool_length
+        r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane + self.tool_length
         height = max(
-            height + _PREFERRED_HEIGHT * self.reach,
-            float(self.first[2]) + _LOWEST_PREFERRED_HEIGHT * self.reach,
+            height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
+            float(self.first[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
         )
         direction = np.array([np.cos(self.side), np.sin(self.side)])
         return np.array([*(self.first[:2] + r * direction), height])
@@ -122,7 +126,7 @@ def random_postures(arm: ArmModel) -> Postures:
 
 def select_suitable_postures(
     postures: Postures, plane: float, tool_length: float
-) -> tuple[Postures, Region]:
+) -> tuple[Postures, StartRegion]:
     """Return postures with the tool downwards, in reach and above `plane`, and their region.
 
     Only those on the side of the first joint with most of them; `plane` is the height z_W of
@@ -140,10 +144,10 @@ def select_suitable_postures(
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
-            _is_within(radius / reach, _RADIUS)
-            & _is_within(from_first[:, 2] / reach, _HEIGHT)
+            _is_within(radius / reach, _RADIUS_RANGE_OVER_REACH)
+            & _is_within(from_first[:, 2] / reach, _HEIGHT_RANGE_OVER_REACH)
             & (tool_height > _MIN_TOOL_HEIGHT_M)
-            & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
+            & (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1),
         ),
         (
             "a joint is below the base plane",
@@ -157,9 +161,9 @@ def select_suitable_postures(
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
     sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
     counts = np.array([float(_is_on_side(angle, side).sum()) for side in sides])
-    counts[0] *= _FRONT_ADVANTAGE
+    counts[0] *= _FRONT_SIDE_COUNT_FACTOR
     side = float(sides[int(np.argmax(counts))])
-    region = Region(plane, tool_length, first, reach, raised, side, tuple(removed))
+    region = StartRegion(plane, tool_length, first, reach, raised, side, tuple(removed))
     return postures[rows[_is_on_side(angle, side)]], region
 
 
@@ -169,19 +173,24 @@ def _is_within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
 
 
 def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_RAD)
+    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_HALF_WIDTH_RAD)
     return near
 
 
-def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
+def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
     It combines limits, singularities, elbow, base plane and preferred place.
     """
-    margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
+    margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
-    sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
-    elbow = np.minimum(elbow_up_share(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
+    sigma = np.minimum(
+        smallest_singular_values(arm, postures) / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0
+    )
+    elbow = (
+        np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
+        / _SUFFICIENT_ELBOW_UP_SHARE
+    )
     origins = postures.origins[:, region.raised, 2]
     low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
@@ -239,7 +248,7 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
     return np.where(size > _NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
 
 
-def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
+def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
     """Return the arm with its sensor frame rotated by R_SA, to z along the tool."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA

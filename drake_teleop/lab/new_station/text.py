@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS, Plan
+from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS_N_M, StationPlan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import Rates
 
-_MAX_WALL_DEPTH_M = 0.01  # largest depth in the wall
+_MAX_PRESS_DEPTH_M = 0.01  # largest depth in the wall
 
 
 def scenario_text(
-    plan: Plan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
+    plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
     """Return the commented scenario; `slave` contains model, packages and sensor frame.
 
@@ -24,7 +24,7 @@ def scenario_text(
         sensor: preset of the wrist sensor, or None.
     """
     s, swing = plan.translation_scale, plan.swing
-    down = 1.5 * swing + min(_MAX_WALL_DEPTH_M, swing / 4.0)
+    down = 1.5 * swing + min(_MAX_PRESS_DEPTH_M, swing / 4.0)
     if plan.place.by_position:
         slave["position"] = round_to_four_digits(plan.place.position)
     else:
@@ -78,13 +78,13 @@ def scenario_text(
     return to_yaml_text(data, head=[head], comments=comments)
 
 
-def wall_of_plan(plan: Plan) -> Wall:
+def wall_of_plan(plan: StationPlan) -> Wall:
     """Return the wall below the tool."""
     x, y, z = plan.lowest
     return Wall(
         position=round_to_four_digits([x, y, z - 1.5 * plan.swing]),
         size=[plan.place.wall, plan.place.wall],
-        stiffness=WALL_STIFFNESS,
+        stiffness=WALL_STIFFNESS_N_M,
     )
 
 

@@ -25,10 +25,10 @@ from drake_teleop.station.simulation import (
 )
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
-Values = dict[str, Any]
+NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_RATIO = 1.5
+_THRESHOLD_OVER_FREE_PEAK = 1.5
 _ALL_AXES_MOTION = Sine(
     duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
 )
@@ -107,7 +107,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
         raw_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_free=calculated_free,
         contact=is_in_contact(touched),
-        threshold=_THRESHOLD_RATIO * float(_force_norm(calculated_free).max()),
+        threshold=_THRESHOLD_OVER_FREE_PEAK * float(_force_norm(calculated_free).max()),
     )
 
 
@@ -142,7 +142,7 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
     return IdealMotion(wrenches[taken[started]], (s, omega, alpha), phi)
 
 
-def ideal_values(run: IdealMotion) -> Values:
+def ideal_values(run: IdealMotion) -> NamedValues:
     """Return peak wrenches and the errors of the calculated load wrench, by name."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
@@ -156,7 +156,7 @@ def ideal_values(run: IdealMotion) -> Values:
     }
 
 
-def free_values(run: FreeMotion, component: int, unit: str) -> Values:
+def free_values(run: FreeMotion, component: int, unit: str) -> NamedValues:
     """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
@@ -172,7 +172,7 @@ def free_values(run: FreeMotion, component: int, unit: str) -> Values:
     }
 
 
-def contact_values(run: ContactMotion) -> Values:
+def contact_values(run: ContactMotion) -> NamedValues:
     t, force_norm = run.touched.t, _force_norm(run.calculated)
     detected = force_norm > run.threshold
     window = _contact_window(run)
@@ -181,7 +181,7 @@ def contact_values(run: ContactMotion) -> Values:
         "true_s": _first_time(t, run.contact),
         "detected_s": _first_time(t, detected),
         "threshold_N": run.threshold,
-        "raw_detectable": bool(raw_force_excess(run).max() > 0),
+        "raw_detectable": bool(raw_force_beyond_free_range(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
         "peak_contact_N": float(force_norm.max()),
         "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
@@ -193,7 +193,7 @@ def contact_values(run: ContactMotion) -> Values:
     }
 
 
-def raw_force_excess(run: ContactMotion) -> Array:
+def raw_force_beyond_free_range(run: ContactMotion) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
@@ -206,7 +206,7 @@ def raw_force_excess(run: ContactMotion) -> Array:
     )
 
 
-def identification_values(load: LoadIdentification, scenario: Scenario) -> Values:
+def identification_values(load: LoadIdentification, scenario: Scenario) -> NamedValues:
     """Return errors and expected accuracy of the load estimate, by name."""
     truth = true_parameters(scenario)
     error = load.estimate - truth
@@ -258,7 +258,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
     return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
 
 
-def reversal_without_contact(run: ContactMotion) -> float | None:
+def time_of_free_reversal(run: ContactMotion) -> float | None:
     """Return the time of the largest raw force after contact [s], or None."""
     t, force_norm = run.touched.t, _force_norm(run.raw)
     window = _contact_window(run)

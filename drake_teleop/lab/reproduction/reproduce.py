@@ -26,15 +26,15 @@ from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     FreeMotion,
-    Values,
+    NamedValues,
     contact_values,
     free_values,
     ideal_values,
     identification_values,
-    reversal_without_contact,
     simulate_contact,
     simulate_free_motion,
     simulate_ideal_motion,
+    time_of_free_reversal,
     true_parameters,
     without_leaf_spring,
 )
@@ -48,19 +48,23 @@ from drake_teleop.lab.reproduction.report import (
     values_by_full_name,
     write_report,
 )
-from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
+from drake_teleop.lab.reproduction.speed import (
+    MakeBarePlant,
+    MakeMovingStation,
+    cpu_time_per_simulated_second,
+)
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 
 # Slow motion of the replay; the contact lasts 40 ms.
-_SLOW_FACTOR = 8.0
-_FORCE_Z, _TORQUE_X = 2, 3
+_REPLAY_SLOWDOWN = 8.0
+_FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
 
 
 def reproduce_command(
     out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
-) -> Values:
+) -> NamedValues:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Return the summary, and the measured speed, which differs between equal runs.
@@ -70,7 +74,7 @@ def reproduce_command(
     with show_progress(progress and not quiet) as stage:
         # Each run has another seed.
         force, torque, contact = (
-            _log_at_hand_rate(LoadScenario(name), seed + k)
+            _with_log_at_hand_rate(LoadScenario(name), seed + k)
             for k, name in enumerate(
                 ("free_motion_force", "free_motion_torque", "contact_transition"), 1
             )
@@ -85,8 +89,8 @@ def reproduce_command(
         ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
         contact_run = simulate_contact(contact, load.estimate, stage)
         summary = {
-            "free_force": free_values(force_run, _FORCE_Z, "N"),
-            "free_torque": free_values(torque_run, _TORQUE_X, "Nm"),
+            "free_force": free_values(force_run, _FORCE_Z_INDEX, "N"),
+            "free_torque": free_values(torque_run, _TORQUE_X_INDEX, "Nm"),
             "ideal": ideal_values(ideal_run),
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
@@ -105,7 +109,7 @@ def reproduce_command(
 
 
 def draw_figures(
-    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
+    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: NamedValues
 ) -> dict[str, Figure]:
     pictures = {
         name: scaling_figure(
@@ -117,31 +121,31 @@ def draw_figures(
             downscaling=1 / run.scenario.force_scaling.force_scale,
         )
         for name, run, component, symbol, unit in (
-            ("fig6", force, _FORCE_Z, "$f_z$", "N"),
-            ("fig7", torque, _TORQUE_X, r"$\tau_x$", "N m"),
+            ("fig6", force, _FORCE_Z_INDEX, "$f_z$", "N"),
+            ("fig7", torque, _TORQUE_X_INDEX, r"$\tau_x$", "N m"),
         )
     }
     detected = summary["contact"]["detected_s"]
     pictures["fig8"] = contact_figure(
         contact.touched.t,
-        contact.raw[:, _FORCE_Z],
-        contact.calculated[:, _FORCE_Z],
+        contact.raw[:, _FORCE_Z_INDEX],
+        contact.calculated[:, _FORCE_Z_INDEX],
         symbol="$f_z$",
         contact=contact.contact,
         detected_s=math.nan if detected is None else detected,
         threshold=contact.threshold,
-        turning_s=reversal_without_contact(contact),
+        turning_s=time_of_free_reversal(contact),
     )
     return pictures
 
 
-def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
+def _with_log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
-def _measure_speed(progress: UpdateProgress) -> Values:
+def _measure_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
-    cost = cpu_seconds(
+    cost = cpu_time_per_simulated_second(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
     )
     return {
@@ -153,7 +157,7 @@ def _measure_speed(progress: UpdateProgress) -> Values:
 def _write_results(
     out: Path,
     seed: int,
-    summary: Values,
+    summary: NamedValues,
     load: LoadIdentification,
     runs: tuple[FreeMotion, FreeMotion, ContactMotion],
     pictures: dict[str, Figure],
@@ -173,7 +177,9 @@ def _write_results(
     load.identification.save(out / "identification.json")
     for name, picture in pictures.items():
         write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
-    write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_FACTOR)
+    write_replay(
+        out / "replay.html", contact.touched, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
+    )
     figures = values_by_full_name(summary)
     write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
     write_report(
@@ -188,7 +194,7 @@ def _write_results(
     )
 
 
-def _captioned_figures(out: Path, figures: Values) -> list[ReportFigure]:
+def _captioned_figures(out: Path, figures: NamedValues) -> list[ReportFigure]:
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",

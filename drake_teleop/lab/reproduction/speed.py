@@ -48,7 +48,7 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
     return simulator
 
 
-def cpu_seconds(
+def cpu_time_per_simulated_second(
     simulators: Mapping[str, Simulator],
     *,
     repetitions: int = 11,

@@ -71,8 +71,8 @@ class Factorial:
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        mean, half = seed_interval(weights @ table)
-        return mean, np.hypot(half, self._missing_seed_widths(table, weights))
+        mean, half = means_and_half_widths_over_seeds(weights @ table)
+        return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
     def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
         place, count = np.zeros(len(self.seen), dtype=np.int64), 1
@@ -81,7 +81,7 @@ class Factorial:
             count *= self.counts[factor]
         return place, count
 
-    def _missing_seed_widths(self, table: Array, weights: Array) -> Array:
+    def _half_widths_of_missing_seeds(self, table: Array, weights: Array) -> Array:
         points, seeds = table.shape
         runs = self.seen.sum(axis=1)
         freedom = runs.sum() - points - seeds + 1
@@ -103,7 +103,7 @@ class Factorial:
         return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
 
 
-def fill_missing(values: Array) -> Array:
+def fill_missing_values(values: Array) -> Array:
     """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
     known = np.isfinite(values)
     if known.all():
@@ -115,7 +115,7 @@ def fill_missing(values: Array) -> Array:
     return np.where(known, values, of_point[:, None] + of_seed)
 
 
-def seed_interval(table: Array) -> tuple[Array, Array]:
+def means_and_half_widths_over_seeds(table: Array) -> tuple[Array, Array]:
     """Return means (n,) over the seeds of a table (n, seeds), and half widths; nan is ignored."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -131,7 +131,7 @@ PARETO_MEASURES = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MeanEstimate:
     """Means over seeds at n levels.
 
     Attributes:
@@ -191,7 +191,7 @@ class PairMeans:
 
 def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
-) -> Estimate:
+) -> MeanEstimate:
     """Return the means over seeds of values (N,) at `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
@@ -200,10 +200,10 @@ def estimate_means(
     np.add.at(runs, (levels[known], seed[known]), 1.0)
     with np.errstate(invalid="ignore"):
         table = sums / runs
-    mean, half = seed_interval(table)
+    mean, half = means_and_half_widths_over_seeds(table)
     # Seeds without some level are excluded: they would shift all other levels.
-    _, effect_half = seed_interval(table - table.mean(axis=0))
-    return Estimate(mean, half, effect_half)
+    _, effect_half = means_and_half_widths_over_seeds(table - table.mean(axis=0))
+    return MeanEstimate(mean, half, effect_half)
 
 
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
@@ -255,7 +255,7 @@ class _MeasureData:
         if self.is_empty:
             return
         used = np.ix_(known, seen.any(axis=0))
-        self.table = fill_missing(values[used])
+        self.table = fill_missing_values(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [
             levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)

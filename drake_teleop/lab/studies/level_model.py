@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.studies.design import Factor, Value
+from drake_teleop.lab.studies.design import Factor, FactorValue
 
 BooleanArray: TypeAlias = NDArray[np.bool_]
 
@@ -49,13 +49,16 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
+_MODEL_VARIANTS = (
+    *((parts, True) for parts in (5, 4, 3)),
+    *((parts, False) for parts in (5, 4, 3, 2)),
+)
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class FactorLevels:
     """Levels of a factor at n points.
 
     Attributes:
@@ -74,7 +77,9 @@ class Levels:
     middles: Array
 
 
-def levels_of_factor_values(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
+def levels_of_factor_values(
+    factor: Factor, column: Sequence[FactorValue], parts: int = 5
+) -> FactorLevels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
@@ -85,14 +90,14 @@ def levels_of_factor_values(factor: Factor, column: Sequence[Value], parts: int 
         present, index = np.unique(index, return_inverse=True)
         middles = (present[:, None] + 0.5) / parts
         names = [f"{factor.low + m * (factor.high - factor.low):.3g}" for m in middles[:, 0]]
-        return Levels(index, names, within, places - 0.5, middles - 0.5)
+        return FactorLevels(index, names, within, places - 0.5, middles - 0.5)
     present, index = np.unique([listed.index(v) for v in column], return_inverse=True)
     middles = np.array([factor.coordinates(value) for value in listed])
     # The last indicator column depends on the others.
     middles = middles[:, : max(middles.shape[1] - 1, 1)]
     middles = (middles - middles.mean(axis=0))[present]
     names = [_format_value(listed[k]) for k in present]
-    return Levels(index, names, None, middles[index], middles)
+    return FactorLevels(index, names, None, middles[index], middles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +112,7 @@ class LevelModel:
         solve: (p, n) pseudo-inverse of X.
     """
 
-    factors: list[Levels]
+    factors: list[FactorLevels]
     codes: list[Array]
     products: dict[tuple[int, int], slice]
     failed: dict[tuple[int, int], BooleanArray]
@@ -205,7 +210,7 @@ class LevelModel:
 
 def fit_level_model(
     factors: Sequence[Factor],
-    columns: Sequence[Sequence[Value]],
+    columns: Sequence[Sequence[FactorValue]],
     known: BooleanArray | None = None,
     *,
     by_chance: bool = True,
@@ -216,7 +221,7 @@ def fit_level_model(
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _MODELS:
+    for parts, products in _MODEL_VARIANTS:
         levels = [
             levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
         ]
@@ -229,7 +234,7 @@ def fit_level_model(
 
 
 def _build_model(
-    factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
+    factors: list[FactorLevels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
     failed = _failed_cells(factors, known, by_chance)
@@ -254,7 +259,7 @@ def _build_model(
 
 
 def _failed_cells(
-    factors: list[Levels], known: BooleanArray, by_chance: bool
+    factors: list[FactorLevels], known: BooleanArray, by_chance: bool
 ) -> dict[tuple[int, int], BooleanArray]:
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
@@ -286,5 +291,5 @@ def _student_quantile(together: int, freedom: int) -> float:
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / together))
 
 
-def _format_value(value: Value) -> str:
+def _format_value(value: FactorValue) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -34,8 +34,8 @@ from drake_teleop.lab.studies.level_model import (
 if TYPE_CHECKING:
     import polars as pl
 
-_MAX_LABELS = 24  # largest number of labelled points
-_MAX_LABEL_LETTERS = 24  # letters that fit below a picture
+_MAX_LABELLED_POINTS = 24  # largest number of labelled points
+_MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
 _HATCH_OF_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
@@ -100,7 +100,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
 
 def _label_levels(axes: Axes, levels: list[str]) -> None:
     axes.set_xticks(range(len(levels)), levels)
-    if len("".join(levels)) > _MAX_LABEL_LETTERS:
+    if len("".join(levels)) > _MAX_UNROTATED_LABEL_LETTERS:
         for label in axes.get_xticklabels():
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
@@ -163,10 +163,10 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO_MEASURES[1:], strict=True):
             axes.plot(points[name], points[PARETO_MEASURES[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _draw_pareto_bars(axes, on_front, name)
+            _draw_pareto_intervals(axes, on_front, name)
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO_MEASURES[0])
-        if on_front.height <= _MAX_LABELS:
+        if on_front.height <= _MAX_LABELLED_POINTS:
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
                 for axes, name in zip(figure.axes, PARETO_MEASURES[1:], strict=True):
                     axes.annotate(str(place), (point[name], point[PARETO_MEASURES[0]]), (4, 4),
@@ -184,7 +184,7 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     return figure
 
 
-def _draw_pareto_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+def _draw_pareto_intervals(axes: Axes, points: pl.DataFrame, name: str) -> None:
     half = [np.nan_to_num(points[f"{key}_half"].to_numpy()) for key in (name, PARETO_MEASURES[0])]
     axes.errorbar(
         points[name], points[PARETO_MEASURES[0]], half[1], half[0],

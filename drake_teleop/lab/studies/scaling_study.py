@@ -33,14 +33,25 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
+MEASURE_OF_CRITERION = {
+    "effort": "effort_Ns",
+    "time": "task_time_s",
+    "force": "contact_force_overshoot_N",
+}
 #: Selections of equally weighted criteria.
-CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
-TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
+CRITERIA_SETS = {
+    "all": tuple(MEASURE_OF_CRITERION),
+    **{name: (name,) for name in MEASURE_OF_CRITERION},
+}
+CRITERIA_OF_TASK = {"reach": ("effort", "time")} | dict.fromkeys(
+    ("touch", "press", "insert"), tuple(MEASURE_OF_CRITERION)
+)
 """Criteria of each task; free reaching has no contact."""
-_OBJECT_STUDY_NAME = "scaling_object"
-_SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
-_NUM_DRAWS, _SEED = 2000, 0
+_ETA_STUDY_NAME = "scaling_object"
+_SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
+    f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
+)
+_NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
 _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 
@@ -75,13 +86,13 @@ def scaling_study_command(
     """Run the missing runs of the scaling studies; write results; return answer.json's content."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY_NAME):
+    for name in (*(f"scaling_{task}" for task in CRITERIA_OF_TASK), _ETA_STUDY_NAME):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASKS}
+    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in CRITERIA_OF_TASK}
     sigmas, gammas = _scale_axes()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
@@ -91,7 +102,7 @@ def scaling_study_command(
         "choice": {
             selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
         },
-        "eta": _eta_effects(rows[_OBJECT_STUDY_NAME]),
+        "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
     with output_folder(out, "answer.json"):
         write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
@@ -106,9 +117,13 @@ def scaling_study_command(
 def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
-    counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
+    counted = {
+        task: [name for name in CRITERIA_OF_TASK[task] if name in criteria] for task in tables
+    }
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
+    draws = np.random.default_rng(_BOOTSTRAP_SEED).multinomial(
+        count, np.full(count, 1 / count), _NUM_BOOTSTRAP_DRAWS
+    )
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
         np.mean([_relative_means(tables[task][name], weights) for name in names], axis=0)
@@ -141,7 +156,7 @@ def _relative_means(table: Array, weights: Array) -> Array:
 
 def _scale_axes() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
-    return factors[_SIGMA], factors[_GAMMA]
+    return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
 
 
 def _index_of_gamma_1() -> int:
@@ -151,8 +166,10 @@ def _index_of_gamma_1() -> int:
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _scale_axes()
     seeds = rows["seed"].n_unique()
-    count = len(gammas) if _GAMMA in rows.columns else 1
-    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASKS[task]}
+    count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
+    measures = {"success": "success"} | {
+        name: MEASURE_OF_CRITERION[name] for name in CRITERIA_OF_TASK[task]
+    }
     tables = {}
     for name, measure in measures.items():
         values = measure_values(rows, measure)
@@ -208,11 +225,11 @@ def _merit_table(
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    etas = sorted(rows[_ETA].unique().to_list())
-    levels = np.array([etas.index(value) for value in rows[_ETA]])
+    etas = sorted(rows[_ETA_FIELD].unique().to_list())
+    levels = np.array([etas.index(value) for value in rows[_ETA_FIELD]])
     seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
-    for measure in ("success", *CRITERIA.values(), "detection_time_s"):
+    for measure in ("success", *MEASURE_OF_CRITERION.values(), "detection_time_s"):
         found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
         for index, row in enumerate(table):
             figures = (found.mean[index], found.half[index], found.effect_half[index])
@@ -224,14 +241,14 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def draw_criteria(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    tasks = [task for task in TASKS if "force" in TASKS[task]]
+    tasks = [task for task in CRITERIA_OF_TASK if "force" in CRITERIA_OF_TASK[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
             levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
-            for axes, measure in zip(line, CRITERIA.values(), strict=True):
+            for axes, measure in zip(line, MEASURE_OF_CRITERION.values(), strict=True):
                 found = estimate_means(
                     measure_values(table, measure), levels, seeds, levels.max() + 1
                 )

@@ -15,10 +15,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
-from drake_teleop.lab.studies.design import Factor, Study, Values
+from drake_teleop.lab.studies.design import Factor, FactorValues, Study
 from drake_teleop.lab.studies.effects import effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
-from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
 from drake_teleop.lab.studies.shards import parse_shard
 from drake_teleop.station.scenario import (
     ReadScenario,
@@ -49,17 +49,17 @@ class StationWork:
     measures: Sequence[str]
     threshold: float
 
-    def scenario(self, values: Values, seed: int) -> Scenario:
+    def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
         return ScenarioFromData(_apply_changes(self.data, changes), self.where)
 
-    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+    def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
         one_time_s = time.monotonic() - start - simulated / run.real_time_factor
         found = evaluate_measures(run.result, scenario, self.measures, self.threshold)
-        return found | {ONE_TIME_COST: max(one_time_s, 0.0)}
+        return found | {ONE_TIME_COST_KEY: max(one_time_s, 0.0)}
 
 
 def study_command(

@@ -15,10 +15,10 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import UpdateProgress, show_progress
-from drake_teleop.lab.studies.design import Factor, Study, Value
+from drake_teleop.lab.studies.design import Factor, FactorValue, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
-    GIVEN_SETTINGS,
+    GIVEN_SETTINGS_NAME,
     MAX_REST_FORCE_N,
     MIN_RENDERED_SHARE,
     SEARCH_MEASURES,
@@ -38,7 +38,7 @@ WALL_FACTORS = (1.2, 2.0)
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
 _BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
-_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
+_MAX_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -70,7 +70,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_lists([GIVEN_SETTINGS], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        _study_of_lists([GIVEN_SETTINGS_NAME], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
         trial,
     )
     quiet = execute(
@@ -84,7 +84,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         low_passes += [f for f in _LOW_PASSES_HZ if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
-    caps = {f: min(_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    caps = {f: min(_MAX_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
     study = Study(
         factors=[
             Factor(field="method", words=list(CANDIDATE_METHODS)),
@@ -94,13 +94,13 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         measures=SEARCH_MEASURES,
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
-    search = [_add_threshold(row, trial, noises) for row in rows]
+    search = [_predict_threshold(row, trial, noises) for row in rows]
     candidates = _best_of_each_method(search)
     found: list[tuple[float, Settings, list[Row]]] = []
     for row in candidates:
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _station_limit(settings_from_values(row), trial, execute)
+        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
@@ -125,7 +125,7 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
     return list(best.values())
 
 
-def _station_limit(
+def _find_gamma_limit_in_station(
     settings: Settings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
@@ -187,7 +187,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _add_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
@@ -219,7 +219,7 @@ def _study_of_lists(
     walls: list[float],
     measures: list[str],
 ) -> Study:
-    values: dict[str, list[Value]] = {
+    values: dict[str, list[FactorValue]] = {
         "method": [*methods],
         "gamma": [gamma],
         "sigma_inertia": [sigma],

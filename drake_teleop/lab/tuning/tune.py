@@ -28,7 +28,7 @@ from drake_teleop.lab.tuning.search import (
     meets_requirements,
     search_settings,
 )
-from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
+from drake_teleop.lab.tuning.stated_set import StatedSet, make_stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
@@ -64,7 +64,7 @@ def tune(
         DrakeTeleopError: for an invalid set, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
-    out, stated = Path(out), stated_set(hands, walls, task)
+    out, stated = Path(out), make_stated_set(hands, walls, task)
     base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
