@@ -35,7 +35,7 @@ from drake_teleop.lab.excitation.excite import (
 from drake_teleop.lab.excitation.optimizer import (
     LIMIT_SHARE,
     DesignProblem,
-    Task,
+    DesignTask,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
@@ -61,8 +61,8 @@ MOTION_NOISE = (0.06, 0.002, 1.5)
 GAIN, CROSS_TALK, DELAY, DRAWS = 0.01, 0.003, 1e-3, 16
 
 
-def task_of(robot: Robot, criterion: str, period: float) -> Task:
-    return Task(
+def task_of(robot: Robot, criterion: str, period: float) -> DesignTask:
+    return DesignTask(
         robot.arm.table, robot.limits, Criterion(criterion, robot.scales), robot.home, period, 5
     )
 
@@ -76,7 +76,7 @@ def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dic
         found = minimise_criterion(DesignProblem(task), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
             trajectory, _ = find_best_within_limits(
-                robot, [it for it in found if it.seconds <= seconds]
+                robot, [it for it in found if it.cpu_time_s <= seconds]
             )
             values[name].append(criterion_values(robot, trajectory)[criterion])
     start = time.thread_time()
@@ -97,7 +97,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
     merits = []
     for x in candidates:
         point = problem.evaluate(x, 1.0, 100.0)
-        merits.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+        merits.append(point.log_criterion + 10 * max(point.limit_uses.max() - 1, 0))
     best, start = float("inf"), time.thread_time()
 
     def evaluate(x: np.ndarray) -> Any:
@@ -105,7 +105,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
         if time.thread_time() - start > seconds:
             raise _TimeIsUpError
         point = problem.evaluate(x, 12.0, 200.0)
-        if point.largest_use <= 1:
+        if point.largest_limit_use <= 1:
             best = min(best, problem.value())
         return point
 
@@ -114,7 +114,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda x: LIMIT_SHARE - evaluate(x).uses},
+            constraints={"type": "ineq", "fun": lambda x: LIMIT_SHARE - evaluate(x).limit_uses},
             options={"maxiter": 1000},
         )
     return best

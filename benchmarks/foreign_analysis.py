@@ -186,7 +186,7 @@ def predicted(axis: OneAxis, stiffness: float, share: float, sampling: Sampling)
         dataclasses.replace(axis, wall_stiffness=stiffness, force_scale=scale), sampling
     )
     multiplier = abs(complex(dominant_multiplier(loop, axis.delay)))
-    return float(f"{multiplier ** ((_LAST - _FIRST) / float(loop.period)):.3g}")
+    return float(f"{multiplier ** ((_LAST - _FIRST) / float(loop.period_s)):.3g}")
 
 
 def slowest(scenario: Scenario, system: Linearization) -> dict[str, float]:

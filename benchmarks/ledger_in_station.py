@@ -144,7 +144,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     inside, at_motors = (accounts[:, HAND] + accounts[:, place] for place in (ACTUAL, MOTOR))
     scale = scenario.force_scaling.force_scale
     rubbed = scale * friction_work(result, scenario)
-    held = (result.t >= task.release - task.judged) & (result.t < task.release)
+    held = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
     weight = sigma * scale * float(true_load(scenario)[6]) * 9.81
     contact = scale * float(result["true_contact_wrench_W"][held, 2].mean())
     felt = float(result["force_to_master"][held, 2].mean()) + weight

@@ -118,7 +118,9 @@ def excite_command(
             )
             report(1.0)
             found = result.excitation
-            shares = dict(zip(tolerance.required_entries, result.reached.tolist(), strict=True))
+            shares = dict(
+                zip(tolerance.required_entries, result.errors_over_tolerances.tolist(), strict=True)
+            )
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
@@ -154,20 +156,24 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
-            use.limit: {"share": use.share, "where": use.what, "t": use.time} for use in found.uses
+            use.limit_name: {"share": use.used_share, "where": use.where, "t": use.time_s}
+            for use in found.uses
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
             for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
-        "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
-        "heaviest_load_kg": float(robot.limits.phi[0]),
+        "noise": {
+            "force [N]": robot.scales.noise_std[0],
+            "torque [N m]": robot.scales.noise_std[1],
+        },
+        "heaviest_load_kg": float(robot.limits.heaviest_phi[0]),
         "assumed": list(robot.assumptions),
     }
 
 
 def _criterion_text(name: str, robot: Robot) -> str:
-    return CRITERION_TEXTS[name].format(L=robot.scales.length)
+    return CRITERION_TEXTS[name].format(L=robot.scales.characteristic_length_m)
 
 
 def trajectory_table(found: Excitation) -> pl.DataFrame:
@@ -211,11 +217,11 @@ def _draw_joints(axes: Axes, found: Excitation) -> None:
 def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
     limits = found.robot.limits
     s, omega, alpha = sensor_motion(found.robot, found.trajectory)
-    wrench = non_contact_wrench(s, omega, alpha, limits.phi)
+    wrench = non_contact_wrench(s, omega, alpha, limits.heaviest_phi)
     t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (
-        (forces, wrench[:, :3], limits.sensor[0], "N"),
-        (torques, wrench[:, 3:], limits.sensor[1], "N m"),
+        (forces, wrench[:, :3], limits.max_sensor_norms[0], "N"),
+        (torques, wrench[:, 3:], limits.max_sensor_norms[1], "N m"),
     ):
         axes.plot(t, part, linewidth=0.9, label=list("xyz"))
         axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")

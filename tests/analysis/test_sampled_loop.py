@@ -238,7 +238,10 @@ def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
     delay = np.array([[0.02], [2.0]])
     found = dominant_multiplier(loop, delay)
     assert found.shape == (2, 2)
-    back = 1 - np.prod((found[..., None] - loop.closed) / (found[..., None] - loop.open), axis=-1)
+    back = 1 - np.prod(
+        (found[..., None] - loop.closed_multipliers) / (found[..., None] - loop.open_multipliers),
+        axis=-1,
+    )
     np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
     one = growth_rate(OneAxis(delay=0.02), STATION)
     assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
@@ -339,7 +342,7 @@ def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: 
 def test_arrays_of_parameters_equal_single_loops() -> None:
     k, sigma = np.array([[0.0], [5.1e3], [2e4]]), np.array([0.0, 1.0])
     both = cut_loop(replace(OneAxis(), wall_stiffness=k, sigma=sigma), JR3)
-    assert both.open.shape == (3, 2, 10)
+    assert both.open_multipliers.shape == (3, 2, 10)
     margins = delay_margin(both)
     w = np.array([1.0, 20.0])
     responses = loop_response(both, w, 0.01)

@@ -38,7 +38,16 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
         study, "_INJECTED_ENERGY_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
     )
     # Use the load of the shipped scenario, which other tests have identified.
-    task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
+    task = Task(
+        0.1,
+        1.1,
+        press_start=1.2,
+        press_end=2.0,
+        release_start=3.0,
+        release_end=3.8,
+        end=4.8,
+        rest_window=0.6,
+    )
     monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))

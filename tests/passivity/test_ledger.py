@@ -202,7 +202,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
         NetworkConfig(delay=0.063, jitter=0.44, loss=0.44, burst=0.26), seed=seed, timeout=0.1,
         intent=charging(t, 2.0, rng.uniform(0.03, 0.06)),
     )  # fmt: skip
-    assert run.silent.max() > 0.2 and run.wall.min() < -100.0
+    assert run.time_without_packets.max() > 0.2 and run.wall.min() < -100.0
     assert run.least_energy_sum(ACTUAL) >= -1e-6
 
 
@@ -217,7 +217,14 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
 )
 def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     """Without initial energy and without information about the hand."""
-    task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
+    task = Task(
+        press_start=3.5,
+        press_end=4.5,
+        release_start=9.0,
+        release_end=10.0,
+        end=12.5,
+        rest_window=1.0,
+    )
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
     pressing = operator_intent(task)
     axis = model(grip, wall)
@@ -263,7 +270,7 @@ def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
         intent=charging(times(9.0), 3.2, 0.02),
     )  # fmt: skip
     rest = run.t > 6.5
-    assert 0.045 < run.silent[rest].max() < 0.05
+    assert 0.045 < run.time_without_packets[rest].max() < 0.05
     assert np.ptp(run.slave[rest]) < 2e-5 and np.ptp(run.felt[rest]) < 0.01
 
 

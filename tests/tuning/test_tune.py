@@ -117,8 +117,8 @@ def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
     found = search_settings(trial(), FakeStation(limit=np.inf, one_axis_limit=2.2))
     assert (found.settings.method, found.settings.sigma_inertia) == ("ledger", 0.0)
     assert found.settings.gamma == pytest.approx(2.2 / 1.1)
-    assert {row["wall"] for row in found.limits} == {20000.0, 24000.0, 40000.0}
-    assert all(row["gamma"] == found.settings.gamma for row in found.limits)
+    assert {row["wall"] for row in found.limit_runs} == {20000.0, 24000.0, 40000.0}
+    assert all(row["gamma"] == found.settings.gamma for row in found.limit_runs)
 
 
 def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin():
@@ -126,9 +126,9 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     station = FakeStation(limit=limit, one_axis_limit=2.2)
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
-    assert {row["gamma"] for row in found.inside} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.inside} == set(trial().stated.corners)
-    assert not all(meets_requirements(row) for row in found.limits)
+    assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
+    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(trial().stated.corners)
+    assert not all(meets_requirements(row) for row in found.limit_runs)
 
 
 def test_search_refuses_a_set_that_no_settings_hold():

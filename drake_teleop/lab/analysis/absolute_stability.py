@@ -118,9 +118,9 @@ class WorstLoads(NamedTuple):
     At w [rad/s], X > 0 is a mass X / w [kg], X < 0 a stiffness -X w [N/m].
     """
 
-    hand: RealArray
-    environment: RealArray
-    resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
+    hand_reactance: RealArray
+    environment_reactance: RealArray
+    loop_resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
 
 
 def worst_loads(H: Complex) -> WorstLoads:

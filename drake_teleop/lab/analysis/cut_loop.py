@@ -40,12 +40,14 @@ _UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as
 class CutLoop:
     """Transfer function L(z) of the loop cut at the displayed force, without the channel."""
 
-    open: Complex  #: (..., n) multipliers of the cut loop
-    closed: Complex  #: (..., n) multipliers of the loop closed without delay
-    period: Array  #: period of the hand [s], (...)
-    angles: Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    phases: Array  #: unwrapped phases of L at these angles
-    signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
+    open_multipliers: Complex  #: (..., n) multipliers of the cut loop
+    closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
+    period_s: Array  #: period of the hand [s], (...)
+    crossing_angles_rad: (
+        Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
+    )
+    crossing_phases_rad: Array  #: unwrapped phases of L at these angles
+    crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
     def from_multipliers(
@@ -80,11 +82,11 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
     """Return the response (N, ...) at `frequency` [rad/s], `delay` one way [s]; limit: 1."""
-    dimensions = max(loop.period.ndim, np.ndim(delay))
+    dimensions = max(loop.period_s.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
-    z = np.exp(1j * w * loop.period)[..., None]
+    z = np.exp(1j * w * loop.period_s)[..., None]
     # Factor by factor, to keep precision for poles close to z = 1.
-    L = 1 - np.prod((z - loop.closed) / (z - loop.open), axis=-1)
+    L = 1 - np.prod((z - loop.closed_multipliers) / (z - loop.open_multipliers), axis=-1)
     return L * np.exp(-2j * w * np.asarray(delay))
 
 
@@ -118,28 +120,38 @@ def _interpolate_within_steps(value: Array, fraction: Array) -> Array:
 
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
-    D = (2 * np.asarray(delay) / loop.period)[..., None]
-    turns = (loop.phases - D * loop.angles) / (2 * np.pi)
+    D = (2 * np.asarray(delay) / loop.period_s)[..., None]
+    turns = (loop.crossing_phases_rad - D * loop.crossing_angles_rad) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
-    around = np.where(loop.angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
-    return outside - (loop.signs * around).sum(axis=-1).astype(np.int64)
+    around = np.where(
+        loop.crossing_angles_rad >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns)
+    )
+    outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
+    return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
-    inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
-    steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
-    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
+    inside = (
+        (loop.crossing_angles_rad > 0)
+        & (loop.crossing_angles_rad < np.pi)
+        & (loop.crossing_signs != 0)
+    )
+    steps = np.mod(loop.crossing_phases_rad, 2 * np.pi) / np.where(
+        inside, loop.crossing_angles_rad, 1.0
+    )
+    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     """Return the closed loop's eigenvalue of largest magnitude, with imaginary part >= 0."""
-    shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
-    n = loop.open.shape[-1]
-    opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))
-    period = np.broadcast_to(loop.period, shape)
+    shape = np.broadcast_shapes(loop.period_s.shape, np.shape(delay))
+    n = loop.open_multipliers.shape[-1]
+    opened, closed = (
+        np.broadcast_to(m, (*shape, n)) for m in (loop.open_multipliers, loop.closed_multipliers)
+    )
+    period = np.broadcast_to(loop.period_s, shape)
     delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
     D = 2 * delay / period
 
@@ -165,7 +177,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
     crossings = np.where(
-        radius > 0, radius * np.exp(1j * scale_loop_to_unit_circle(high).angles), 0
+        radius > 0, radius * np.exp(1j * scale_loop_to_unit_circle(high).crossing_angles_rad), 0
     )
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]

@@ -61,7 +61,7 @@ def summarise_diagram_stability(
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _decay_and_frequency(
-        complex(dominant_multiplier(loop, axis.delay)), float(loop.period)
+        complex(dominant_multiplier(loop, axis.delay)), float(loop.period_s)
     )
     figures: dict[str, Any] = {
         "point": name,

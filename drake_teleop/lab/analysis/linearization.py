@@ -328,10 +328,10 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _StateGroup:
-    system: str
-    group: int | None
-    part: slice | NDArray[np.intp]
-    steps: Array  # displacements for the differences
+    system_name: str
+    discrete_group: int | None
+    indices: slice | NDArray[np.intp]
+    difference_steps: Array  # displacements for the differences
 
 
 class _PeriodSimulator:
@@ -374,15 +374,15 @@ class _PeriodSimulator:
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
-        self._steps = np.concatenate([group.steps for group in self._groups])
+        self._steps = np.concatenate([group.difference_steps for group in self._groups])
         # The sensor's memory follows from the other states; it is of order 1.
-        sensed = [group.system == "wrist_sensor" for group in self._groups]
-        counts = [len(group.steps) for group in self._groups]
+        sensed = [group.system_name == "wrist_sensor" for group in self._groups]
+        counts = [len(group.difference_steps) for group in self._groups]
         self._sizes = np.where(np.repeat(sensed, counts), _UNIT_STEP, self._steps)
         self.states = tuple(
-            f"{g.system} {'' if g.group is None else g.group}[{k}]"
+            f"{g.system_name} {'' if g.discrete_group is None else g.discrete_group}[{k}]"
             for g in self._groups
-            for k in range(len(g.steps))
+            for k in range(len(g.difference_steps))
         )
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
@@ -433,22 +433,24 @@ class _PeriodSimulator:
     def get_state(self) -> Array:
         parts = []
         for group in self._groups:
-            context = self._get_context(group.system)
-            if group.group is None:
+            context = self._get_context(group.system_name)
+            if group.discrete_group is None:
                 parts.append(context.get_continuous_state_vector().CopyToVector())
             else:
-                parts.append(context.get_discrete_state(group.group).value()[group.part])
+                parts.append(
+                    context.get_discrete_state(group.discrete_group).value()[group.indices]
+                )
         return np.concatenate(parts)
 
     def _set_state(self, x: Array) -> None:
-        ends = np.cumsum([len(group.steps) for group in self._groups])
+        ends = np.cumsum([len(group.difference_steps) for group in self._groups])
         for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
-            context = self._get_context(group.system)
-            if group.group is None:
+            context = self._get_context(group.system_name)
+            if group.discrete_group is None:
                 context.SetContinuousState(values)
             else:
-                state = context.get_mutable_discrete_state(group.group)
-                state.get_mutable_value()[group.part] = values
+                state = context.get_mutable_discrete_state(group.discrete_group)
+                state.get_mutable_value()[group.indices] = values
         self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
     def _apply_inputs(self, u: Array) -> None:

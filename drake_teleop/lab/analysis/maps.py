@@ -43,15 +43,15 @@ class StabilityMap:
 
     x_name: str
     y_name: str
-    x: Array  #: (nx,) values of the first parameter
-    y: Array  #: (ny,) values of the second parameter
-    unstable: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
+    x_values: Array  #: (nx,) values of the first parameter
+    y_values: Array  #: (ny,) values of the second parameter
+    num_unstable_multipliers: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
     distortion: Array  #: (ny, nx), valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        return self.unstable == 0
+        return self.num_unstable_multipliers == 0
 
 
 def stability_map(
@@ -100,7 +100,7 @@ def force_distortion(
 ) -> Array:
     """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
-        loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
+        loop.period_s.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
     )
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     s: Complex = 1j * w.reshape(-1, *[1] * len(shape))

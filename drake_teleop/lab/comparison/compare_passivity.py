@@ -114,9 +114,9 @@ def compare_command(
             "method": method,
             "network": network,
             "verdict": cell.verdict,
-            "felt_N": [felt for felt, _ in cell.forces],
-            "pressed_N": [pressed for _, pressed in cell.forces],
-            "leaked_J": cell.leaked,
+            "felt_N": [felt for felt, _ in cell.rendered_and_contact_forces],
+            "pressed_N": [pressed for _, pressed in cell.rendered_and_contact_forces],
+            "leaked_J": cell.leaked_energy_J,
         }
         for (method, network), cell in decision_table(summary).items()
     ]
@@ -175,7 +175,7 @@ def simulate_press(
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
-    held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
+    held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
@@ -193,7 +193,7 @@ def _run_while_stable(
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
-    hold = dataclasses.replace(task, end=task.release)
+    hold = dataclasses.replace(task, end=task.release_start)
     for part in (hold, task):
         advance_without_garbage_collection(
             simulator, 1e-3 * round(1e3 * (settle + part.end))

@@ -31,14 +31,14 @@ LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 def task_for_round_trip(round_trip: float) -> Task:
     """Return the times of the task for a round-trip delay [s]."""
     return Task(
-        swing=0.3,
-        swung=1.8,
-        press=2.3 + round_trip,
-        pressed=3.1 + round_trip,
-        release=5.1 + 4 * round_trip,
-        released=5.9 + 4 * round_trip,
+        swing_start=0.3,
+        swing_end=1.8,
+        press_start=2.3 + round_trip,
+        press_end=3.1 + round_trip,
+        release_start=5.1 + 4 * round_trip,
+        release_end=5.9 + 4 * round_trip,
         end=8.1 + 6 * round_trip,
-        judged=1.0,
+        rest_window=1.0,
     )
 
 
@@ -59,8 +59,8 @@ def delayed_contact(
     task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
     settle = 0.5
     swing = Sine(
-        t_start=settle + task.swing,
-        duration=task.swung - task.swing,
+        t_start=settle + task.swing_start,
+        duration=task.swing_end - task.swing_start,
         ramp=0.5,
         frequency=1.5,
         translation=[0.005, 0.0, 0.02],
@@ -71,8 +71,8 @@ def delayed_contact(
     press, retreat = (
         MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
         for start, end, translation in (
-            (task.press, task.pressed, reach),
-            (task.release, task.released, [-x for x in reach]),
+            (task.press_start, task.press_end, reach),
+            (task.release_start, task.release_end, [-x for x in reach]),
         )
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()

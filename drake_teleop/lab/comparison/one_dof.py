@@ -45,14 +45,14 @@ _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest positio
 class Task:
     """Times of the operator's task [s]: swing, rest, press, hold, retreat, rest."""
 
-    swing: float = 0.5
-    swung: float = 3.0
-    press: float = 5.5
-    pressed: float = 6.5
-    release: float = 11.5
-    released: float = 12.5
+    swing_start: float = 0.5
+    swing_end: float = 3.0
+    press_start: float = 5.5
+    press_end: float = 6.5
+    release_start: float = 11.5
+    release_end: float = 12.5
     end: float = 17.0
-    judged: float = 1.9  #: length of the windows in which rest is required
+    rest_window: float = 1.9  #: length of the windows in which rest is required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +113,8 @@ class OneDofRun:
     command: NDArray[np.float64]  #: m, received by the slave
     felt: NDArray[np.float64]  #: N, on the hand
     wall: NDArray[np.float64]  #: N, on the slave
-    energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
-    silent: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
+    channel_energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
+    time_without_packets: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
     accounts: NDArray[np.float64]  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
@@ -223,10 +223,12 @@ def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION_M)
-    fade = np.minimum(_smooth_ramp(t, task.swing, 0.5), 1 - _smooth_ramp(t, task.swung - 0.5, 0.5))
-    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
-    pressing = _smooth_ramp(t, task.press, task.pressed - task.press)
-    releasing = _smooth_ramp(t, task.release, task.released - task.release)
+    fade = np.minimum(
+        _smooth_ramp(t, task.swing_start, 0.5), 1 - _smooth_ramp(t, task.swing_end - 0.5, 0.5)
+    )
+    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing_start))
+    pressing = _smooth_ramp(t, task.press_start, task.press_end - task.press_start)
+    releasing = _smooth_ramp(t, task.release_start, task.release_end - task.release_start)
     x += (_PRESS_DEPTH_M - _REST_POSITION_M) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
@@ -243,7 +245,7 @@ def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMea
         slave=run.slave,
         felt=run.felt,
         pressed=model.force_scale * model.gamma * run.wall,
-        energy=run.energy.sum(axis=1),
+        energy=run.channel_energy.sum(axis=1),
         task=task,
     )
 
@@ -272,8 +274,8 @@ def figures_of_traces(
     def window_slice(start: float, stop: float) -> slice:
         return slice(round(start / dt), round(stop / dt))
 
-    hold = window_slice(task.release - task.judged, task.release)
-    rest = window_slice(task.end - task.judged, task.end)
+    hold = window_slice(task.release_start - task.rest_window, task.release_start)
+    rest = window_slice(task.end - task.rest_window, task.end)
     hunting = max(
         _peak_to_peak_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest)
     )
@@ -283,8 +285,8 @@ def figures_of_traces(
         default=0.0,
     )
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
-    after = min(round((task.released + 2.0) / dt), len(t) - 1)
-    start = round(task.press / dt)
+    after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
+    start = round(task.press_start / dt)
     return RunMeasures(
         stable=bool(
             hunting < _MAX_MOTION_AT_REST_M and turning < _MAX_MOTION_AT_REST_M / TIP_DISTANCE_M
@@ -295,7 +297,9 @@ def figures_of_traces(
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(np.sqrt(np.mean(felt[window_slice(task.swing, task.swung)] ** 2))),
+        free_force=float(
+            np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
+        ),
         rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )

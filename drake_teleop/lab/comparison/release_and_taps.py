@@ -54,7 +54,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
 
     release_time = 3.0 + 3 * round_trip
     end = release_time + _TIME_AFTER_RELEASE_S
-    task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, judged=0.1)
+    task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
     pressing = operator_intent(task)
     release_row = round(release_time / PERIOD)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))

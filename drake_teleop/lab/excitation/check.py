@@ -28,19 +28,19 @@ class LimitUse:
     """Largest use of one limit by a motion.
 
     Attributes:
-        share: largest |value| over the limit; above 1 violates the limit.
-        time: time of this value [s].
-        what: joint, axis or pair of shapes with this value.
+        used_share: largest |value| over the limit; above 1 violates the limit.
+        time_s: time of this value [s].
+        where: joint, axis or pair of shapes with this value.
     """
 
-    limit: str
-    share: float
-    time: float
-    what: str
+    limit_name: str
+    used_share: float
+    time_s: float
+    where: str
 
     def __str__(self) -> str:
-        share = f"{self.share:.1%}" if np.isfinite(self.share) else "more than all"
-        return f"{share} of the {self.limit} limit ({self.what}, at {self.time:.3f} s)"
+        share = f"{self.used_share:.1%}" if np.isfinite(self.used_share) else "more than all"
+        return f"{share} of the {self.limit_name} limit ({self.where}, at {self.time_s:.3f} s)"
 
 
 def check_trajectory(
@@ -75,15 +75,19 @@ def check_motion(
         _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
         _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
         _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _largest_use("torque", np.abs(motion.torque) / limits.effort, t, names),
-        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORM_NAMES),
-        _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
+        _largest_use("torque", np.abs(motion.joint_torques) / limits.max_torques, t, names),
+        _largest_use(
+            "sensor", motion.sensor_norms / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES
+        ),
+        _largest_use("workspace", motion.workspace_uses, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_use("clearance", motion.clearance_uses[:, np.newaxis], t, ("",)),
     ]
-    uses[-1] = replace(uses[-1], what=motion.nearest[int(np.argmax(motion.clearance))])
+    uses[-1] = replace(uses[-1], where=motion.nearest_shapes[int(np.argmax(motion.clearance_uses))])
     without_end = {"position": limits.q_half, "workspace": limits.box_half}
     missing = [name for name, half in without_end.items() if np.isinf(half).all()]
-    return sorted((use for use in uses if use.limit not in missing), key=lambda use: -use.share)
+    return sorted(
+        (use for use in uses if use.limit_name not in missing), key=lambda use: -use.used_share
+    )
 
 
 def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> LimitUse:
@@ -93,11 +97,11 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 @dataclass(frozen=True)
 class _MotionLimitSignals:
-    torque: Array
-    sensor: Array
-    workspace: Array
-    clearance: Array  #: required over actual distance
-    nearest: list[str]
+    joint_torques: Array
+    sensor_norms: Array
+    workspace_uses: Array
+    clearance_uses: Array  #: required over actual distance
+    nearest_shapes: list[str]
 
 
 def _evaluate_motion(

@@ -41,13 +41,13 @@ class CriterionScales(NamedTuple):
     """Noise, length and load that scale the criteria.
 
     Attributes:
-        noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
-        length: characteristic length L [m] of kappa_w10.
+        noise_std: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
+        characteristic_length_m: characteristic length L [m] of kappa_w10.
         phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
-    noise: tuple[float, float]
-    length: float
+    noise_std: tuple[float, float]
+    characteristic_length_m: float
     phi: Array
 
 
@@ -70,16 +70,22 @@ class Criterion:
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")
-        sigma = scales.noise if whitened else (1.0, 1.0)
+        sigma = scales.noise_std if whitened else (1.0, 1.0)
         self._rows = np.repeat(1 / np.array(sigma), 3)
         columns = np.ones(16 if self.with_offsets else 10)
         if name == "kappa_w10":
-            columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
+            columns = np.array(
+                [1.0]
+                + 3 * [scales.characteristic_length_m]
+                + 6 * [scales.characteristic_length_m**2]
+            )
         elif whitened:
             columns = _acceptable_errors(scales.phi)
         self._columns = columns
 
-    def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
+    def scaled_regressor_and_information(
+        self, s: Array, omega: Array, alpha: Array
+    ) -> tuple[Array, Array]:
         """Return the scaled regressor (6 T, c) and the information matrix (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
@@ -89,7 +95,7 @@ class Criterion:
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
         """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
-        _, gram = self.information(s, omega, alpha)
+        _, gram = self.scaled_regressor_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
@@ -102,7 +108,7 @@ class Criterion:
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
         """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
-        rows, gram = self.information(s, omega, alpha)
+        rows, gram = self.scaled_regressor_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)

@@ -44,7 +44,8 @@ def write_motion_replay(path: Path, found: Excitation) -> None:
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
     force = np.linalg.norm(
-        non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.phi)[:, :3], axis=1
+        non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.heaviest_phi)[:, :3],
+        axis=1,
     )
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
     film = ReplayFile(

@@ -25,19 +25,19 @@ class SensorNoise(NamedTuple):
     """Noise of the 12 channels [f, tau, s, alpha] and its filters.
 
     Attributes:
-        weights: (6,) standard deviations by which the estimator divides the wrench [N, N m].
-        white: (12,) two-sided spectral densities of white noise [unit^2 s].
-        walk: (12,) random walks: variance per second [unit^2 / s].
-        place: (3,) position p_SoAo_S of the accelerometer [m].
-        filters: transfer functions (numerator, denominator) from the noise of s and of alpha to the
-            estimates; None without accelerometer.
+        assumed_wrench_std: (6,) deviations by which the estimator divides the wrench [N, N m].
+        white_noise_densities: (12,) two-sided spectral densities of white noise [unit^2 s].
+        random_walk_variances: (12,) random walks: variance per second [unit^2 / s].
+        p_SoAo_S: (3,) position p_SoAo_S of the accelerometer [m].
+        motion_error_filters: transfer functions (numerator, denominator) from the noise of s
+            and of alpha to the estimates; None without accelerometer.
     """
 
-    weights: Array
-    white: Array
-    walk: Array
-    place: Array
-    filters: tuple[tuple[Array, Array], tuple[Array, Array]] | None
+    assumed_wrench_std: Array
+    white_noise_densities: Array
+    random_walk_variances: Array
+    p_SoAo_S: Array
+    motion_error_filters: tuple[tuple[Array, Array], tuple[Array, Array]] | None
 
 
 def sensor_noise(
@@ -67,25 +67,25 @@ def predicted_covariance(
 ) -> Array:
     """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
-    weighted = rows / noise.weights[:, np.newaxis] ** 2
+    weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)
     # Balance before inversion: the columns have different units.
     size = np.sqrt(np.diag(gram))
     inverse = np.linalg.inv(gram / np.outer(size, size)) / np.outer(size, size)
     influence = np.zeros((len(s), 12, 16))
     influence[:, :6] = weighted @ inverse
-    if noise.filters is not None:
-        of_s, of_alpha = noise.filters
+    if noise.motion_error_filters is not None:
+        of_s, of_alpha = noise.motion_error_filters
         of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
         through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
-        through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
+        through_alpha = of_motion[:, 3:] + cross_matrix(noise.p_SoAo_S).T @ through_s
         influence[:, 6:9] = through_s
         influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
-    of_white = _covariance_of_influence(influence, noise.white) / step
-    return of_white + _covariance_of_influence(later, noise.walk) * step
+    of_white = _covariance_of_influence(influence, noise.white_noise_densities) / step
+    return of_white + _covariance_of_influence(later, noise.random_walk_variances) * step
 
 
 def _covariance_of_influence(influence: Array, variances: Array) -> Array:

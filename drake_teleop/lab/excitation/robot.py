@@ -70,7 +70,7 @@ class Robot:
     noise: SensorNoise
     home: Array
     assumptions: tuple[str, ...]
-    folders: tuple[TemporaryDirectory[str], ...] = ()
+    temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
@@ -205,17 +205,17 @@ def _make_robot(
         q_half=_JOINT_LIMIT_SHARE * half,
         velocity=_JOINT_LIMIT_SHARE * arm.velocity_limit,
         acceleration=arm.acceleration_limit,
-        effort=_JOINT_LIMIT_SHARE * arm.effort_limit,
-        phi=phi,
-        sensor=np.array([force, torque, sensor.acceleration_range, alpha]),
+        max_torques=_JOINT_LIMIT_SHARE * arm.effort_limit,
+        heaviest_phi=phi,
+        max_sensor_norms=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
-        capsule_row=rows,
+        capsule_links=rows,
         capsule_ends=ends,
         capsule_radius=radii,
-        pairs=pairs,
-        distances=distances,
+        capsule_pairs=pairs,
+        min_pair_distances=distances,
         clearance=CLEARANCE_M,
     )
     return Robot(
@@ -230,7 +230,7 @@ def _make_robot(
         noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home=middle if start is None else start,
         assumptions=tuple(assumptions),
-        folders=tuple(folders),
+        temporary_folders=tuple(folders),
     )
 
 

@@ -36,8 +36,8 @@ from drake_teleop.lab.excitation.limits import (
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
     DesignProblem,
+    DesignTask,
     Evaluation,
-    Task,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.prediction import (
@@ -84,10 +84,10 @@ _REGULARISATION = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class ShortestMotion:
-    """Checked motion; `reached` (k,): predicted errors over tolerances, at most 1."""
+    """Checked motion; `errors_over_tolerances` (k,) are predicted errors, at most 1."""
 
     excitation: Excitation
-    reached: Array
+    errors_over_tolerances: Array
 
 
 def design_shortest_motion(
@@ -104,11 +104,11 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * sidak_factor(
+    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi) * sidak_factor(
         len(tolerance.required_entries)
     )
     factor = np.ones(len(errors))
-    task = Task(
+    task = DesignTask(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
@@ -120,7 +120,7 @@ def design_shortest_motion(
         found = minimise_criterion(
             problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
         )
-        found = [each for each in found if each.value <= _MAX_PERIOD_S]
+        found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
             if (empty_rounds := empty_rounds + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
                 break
@@ -128,7 +128,9 @@ def design_shortest_motion(
             continue
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
-        covariance = predicted_covariance(*motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi)
+        covariance = predicted_covariance(
+            *motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.heaviest_phi
+        )
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_MISFIT_OF_VARIED_MOTION else None
@@ -177,16 +179,16 @@ class ShortestMotionProblem(DesignProblem):
         best: unknowns of the shortest period passed to `value`.
     """
 
-    def __init__(self, task: Task, errors: Array, robot: Robot, around: Array | None) -> None:
+    def __init__(self, task: DesignTask, errors: Array, robot: Robot, around: Array | None) -> None:
         super().__init__(task)
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = relative_white_noise_densities(robot.noise, robot.limits.phi)
-        self._roots = np.sqrt(robot.noise.white[:6])
-        samples, n = self._vectors.shape[1], len(task.home)
+        self._noise = relative_white_noise_densities(robot.noise, robot.limits.heaviest_phi)
+        self._roots = np.sqrt(robot.noise.white_noise_densities[:6])
+        samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
-        self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
+        self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
@@ -200,7 +202,7 @@ class ShortestMotionProblem(DesignProblem):
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
-        self.task = replace(task, period=period)  # the size of motions depends on the period
+        self.task = replace(task, period_s=period)  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
         self.task = task
         return np.append(x, np.log(period))
@@ -217,21 +219,21 @@ class ShortestMotionProblem(DesignProblem):
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
-        task, n, self._at = self.task, len(self.task.home), x.copy()
+        task, n, self._at = self.task, len(self.task.home_posture), x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
         q, qd, qdd = q + x[:n], qd / T, qdd / T**2
-        write_link_motions(task.table, q, qd, qdd, self._motions)
+        write_link_motions(task.arm_table, q, qd, qdd, self._motions)
         write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
-        criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
+        criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
-            task.table,
+            task.arm_table,
             q,
             qd,
             qdd,
@@ -297,11 +299,11 @@ class ShortestMotionProblem(DesignProblem):
 
 def relative_white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
-    density = np.diag(noise.white[:6])
-    if noise.filters is not None:
+    density = np.diag(noise.white_noise_densities[:6])
+    if noise.motion_error_filters is not None:
         at_So = np.eye(6)
-        at_So[:3, 3:] = cross_matrix(noise.place)
+        at_So[:3, 3:] = cross_matrix(noise.p_SoAo_S)
         through = spatial_inertia_matrix(phi) @ at_So
-        density = density + through @ np.diag(noise.white[6:]) @ through.T
-    roots = np.sqrt(noise.white[:6])
+        density = density + through @ np.diag(noise.white_noise_densities[6:]) @ through.T
+    roots = np.sqrt(noise.white_noise_densities[:6])
     return density / np.outer(roots, roots)

@@ -102,10 +102,10 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     from rich.table import Table
 
     table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
-    tool = "of the model" if plan.own_tool else "on the sensor"
+    tool = "of the model" if plan.has_own_tool else "on the sensor"
     for name, value in (
-        ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
-        ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
+        ("Joints", f"{len(plan.joint_names)}: {', '.join(plan.joint_names)}"),
+        ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
         ("Start", f"sensor at {round_to_four_digits(plan.place.position)} m, tool down"),
         ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
@@ -113,9 +113,9 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
         table.add_row(name, value)
     console = Console()
     console.print(table)
-    notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
+    notes = [f"note: {plan.tool_axis_advice}"] if plan.tool_axis_advice else []
     notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
-    notes += [f"warning: {overlap}" for overlap in plan.overlaps]
+    notes += [f"warning: {overlap}" for overlap in plan.overlap_warnings]
     for line in (
         *notes,
         f"picture of the start: {picture}",

@@ -42,7 +42,7 @@ _HULL_SAMPLE_DIRECTIONS = np.column_stack(
 
 def draw_start(plan: StationPlan, title: str) -> Figure:
     """Draw the shapes in the start posture; meshes as convex hulls."""
-    shapes, wall = plan.shapes, wall_of_plan(plan)
+    shapes, wall = plan.posture_shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
@@ -53,7 +53,9 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
     with plot_style():
         figure = Picture(figsize=(10.0, 5.0), facecolor="white")
         figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
-        side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
+        side = np.degrees(
+            np.arctan2(*(plan.lowest_tool_point_W - shapes.arm.table[0, 9:12])[1::-1])
+        )
         for k, (elevation, azimuth) in enumerate(_VIEW_ANGLES_DEG):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
             collection = Poly3DCollection(
@@ -61,17 +63,17 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
             )
             axes.add_collection3d(collection)
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
-            _draw_plane(axes, lower, upper, plan.plane)
+            _draw_plane(axes, lower, upper, plan.base_plane_height)
             _draw_triad(axes, shapes, _TRIAD_LENGTH_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
-            _fit_view(axes, lower, upper, plan.plane)
+            _fit_view(axes, lower, upper, plan.base_plane_height)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
 
 
 def _caption(plan: StationPlan) -> str:
-    gap = 1e3 * (plan.lowest[2] - wall_of_plan(plan).position[2])
-    plane = round(plan.plane, 2) + 0.0  # not -0
+    gap = 1e3 * (plan.lowest_tool_point_W[2] - wall_of_plan(plan).position[2])
+    plane = round(plan.base_plane_height, 2) + 0.0  # not -0
     return (
         f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
         " y green, z blue; meshes as convex hulls"
@@ -144,7 +146,7 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
 
 
 def _joint_chain_points(plan: StationPlan) -> Array:
-    at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
+    at_start = postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis])
     return np.vstack([at_start.origins[0], at_start.p_WS])
 
 

@@ -83,31 +83,31 @@ class StartPlace(NamedTuple):
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: True if the position specifies the pose.
+        is_set_by_position: True if the position specifies the pose.
         q: (n,) joint positions at the start [rad].
-        half: half edge of the reachable cube around the start [m].
-        room: smallest distance of a joint to its limit, over half the joint's range.
-        score: merit of the posture, see `posture_scores`, without the cost of overlaps.
-        wall: edge of the wall that fits below the tool [m].
-        vertical: True if the arm can only move up and down by `half`.
-        overlaps: True if shapes of the arm overlap.
+        cube_half_m: half edge of the reachable cube around the start [m].
+        joint_margin: smallest distance of a joint to its limit, over half the joint's range.
+        posture_score: merit of the posture, see `posture_scores`, without the cost of overlaps.
+        wall_edge_m: edge of the wall that fits below the tool [m].
+        moves_only_vertically: True if the arm can only move up and down by `cube_half_m`.
+        has_overlaps: True if shapes of the arm overlap.
     """
 
     pose: Array
-    by_position: bool
+    is_set_by_position: bool
     q: Array
-    half: float
-    room: float
-    score: float = 0.0
-    wall: float = WALL_EDGES_M[0]
-    vertical: bool = False
-    overlaps: bool = False
+    cube_half_m: float
+    joint_margin: float
+    posture_score: float = 0.0
+    wall_edge_m: float = WALL_EDGES_M[0]
+    moves_only_vertically: bool = False
+    has_overlaps: bool = False
 
     @property
     def reachable_text(self) -> str:
         """Reachable displacements from the start, as a text."""
-        directions = "up and down" if self.vertical else "in all directions"
-        return f"{1e3 * self.half:g} mm {directions}"
+        directions = "up and down" if self.moves_only_vertically else "in all directions"
+        return f"{1e3 * self.cube_half_m:g} mm {directions}"
 
     @property
     def position(self) -> Array:
@@ -117,7 +117,7 @@ class StartPlace(NamedTuple):
     @property
     def home(self) -> list[float]:
         """Joint positions for `slave.home`; empty if the position is sufficient."""
-        return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
+        return [] if self.is_set_by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 class TrialWalls(Environment):
@@ -167,19 +167,21 @@ def find_start_place(
     for rows in _rows_to_solve(pointed, postures, region, shapes):
         solved = _solve_candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
         found += [_with_largest_wall(shapes, place, region) for place in solved]
-        if not all(place.overlaps for place in found):
+        if not all(place.has_overlaps for place in found):
             break
-    found.sort(key=lambda place: place.score, reverse=True)
-    good = [place for place in found if place.score > found[0].score - _SCORE_TOLERANCE]
+    found.sort(key=lambda place: place.posture_score, reverse=True)
+    good = [
+        place for place in found if place.posture_score > found[0].posture_score - _SCORE_TOLERANCE
+    ]
     best = None
     for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
-        if best is None or best.half == 0.0:
+        if best is None or best.cube_half_m == 0.0:
             cubes = [
                 _with_reachable_cube(pointed, place, is_free, vertical)
                 for place in places[:_MAX_TESTED_CUBES]
             ]
             best = max(cubes, key=_place_merit, default=None)
-    if best is None or best.half == 0.0:
+    if best is None or best.cube_half_m == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
             f" ({_describe_removals(region, len(postures.q))})",
@@ -190,7 +192,7 @@ def find_start_place(
     pose_into(arm.table, best.q, pose)
     if axis == "z":
         pose = best.pose
-    return best._replace(pose=pose, by_position=best.by_position and axis == "z")
+    return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
 def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
@@ -206,7 +208,7 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
 
 
 def _describe_removals(region: StartRegion, left: int) -> str:
-    causes = ", ".join(f"in {count} {name}" for name, count in region.removed if count)
+    causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
@@ -281,7 +283,8 @@ def _with_largest_wall(
     walls = _move_walls_below_tool(shapes)
     depths = dict.fromkeys(walls, 0.0)
     cost = max(
-        region.plane - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
+        region.plane_height
+        - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
         0.0,
     )
     overlaps = False
@@ -297,9 +300,11 @@ def _with_largest_wall(
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)
     cost += list(depths.values())[rank]
-    score = place.score - _OVERLAP_COST_PER_M * cost - _COST_OF_ANY_OVERLAP * overlaps
+    score = place.posture_score - _OVERLAP_COST_PER_M * cost - _COST_OF_ANY_OVERLAP * overlaps
     score -= _COST_OF_SMALLER_WALL * (rank - large)
-    return place._replace(score=score, wall=WALL_EDGES_M[rank], overlaps=overlaps)
+    return place._replace(
+        posture_score=score, wall_edge_m=WALL_EDGES_M[rank], has_overlaps=overlaps
+    )
 
 
 def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
@@ -333,10 +338,10 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
 
 def _place_merit(place: StartPlace) -> tuple[float, float, bool, float]:
     enough_room, enough_space = (
-        min(place.room, _SUFFICIENT_JOINT_MARGIN),
-        min(place.half, _SUFFICIENT_CUBE_HALF_M),
+        min(place.joint_margin, _SUFFICIENT_JOINT_MARGIN),
+        min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_M),
     )
-    return enough_room, enough_space, place.by_position, place.half
+    return enough_room, enough_space, place.is_set_by_position, place.cube_half_m
 
 
 def _with_reachable_cube(
@@ -353,8 +358,8 @@ def _with_reachable_cube(
         if not all(moves(arm, place, half * each) for each in signs):
             break
         largest = half
-    room = place.room if largest else 0.0
-    return place._replace(half=largest, room=room, vertical=vertical)
+    room = place.joint_margin if largest else 0.0
+    return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
 def _reaches_by_ik(arm: ArmModel, place: StartPlace, displacement: Array) -> bool:

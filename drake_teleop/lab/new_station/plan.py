@@ -59,35 +59,35 @@ class StationPlan:
     """Start, scales and motions of a new station.
 
     Args:
-        tool: stand-in for a missing tool, or None.
-        tool_mass: mass beyond the sensor [kg].
-        own_tool: True if the model contains the tool.
-        swing: amplitude of the slave in free motion [m].
-        lowest: (3,) position in W of the tool's lowest point at the start [m].
-        tip: (3,) p_STip of this point [m]; empty for a tool along z_S.
-        axis_note: advice if the tool is not along z_S.
-        overlaps: sentences about overlaps of shapes at the start.
-        plane: height of the base plane [m].
+        stand_in_tool: stand-in for a missing tool, or None.
+        tool_mass_kg: mass beyond the sensor [kg].
+        has_own_tool: True if the model contains the tool.
+        swing_amplitude_m: amplitude of the slave in free motion [m].
+        lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
+        tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
+        tool_axis_advice: advice if the tool is not along z_S.
+        overlap_warnings: sentences about overlaps of shapes at the start.
+        base_plane_height: height of the base plane [m].
         weak_joints: joints whose torque limits cannot hold the arm.
-        shapes: shapes of arm and tool, at the start.
+        posture_shapes: shapes of arm and tool, at the start.
     """
 
-    joints: tuple[str, ...]
-    tool: Tool | None
-    tool_mass: float
-    own_tool: bool
+    joint_names: tuple[str, ...]
+    stand_in_tool: Tool | None
+    tool_mass_kg: float
+    has_own_tool: bool
     place: StartPlace
     translation_scale: float
     force_scale: float
-    swing: float
-    lowest: Array
-    tip: list[float]
+    swing_amplitude_m: float
+    lowest_tool_point_W: Array
+    tip_S: list[float]
     assumptions: tuple[str, ...]
-    axis_note: str
-    overlaps: tuple[str, ...]
-    plane: float
+    tool_axis_advice: str
+    overlap_warnings: tuple[str, ...]
+    base_plane_height: float
     weak_joints: tuple[str, ...]
-    shapes: PostureShapes
+    posture_shapes: PostureShapes
 
 
 def plan_station(
@@ -122,7 +122,7 @@ def plan_station(
     figures = FIGURES.get(device)
     room = _PHANTOM_HALF_SIZE_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
-    translation_scale = _floor_two_digits(min(place.half / room, 1.0))
+    translation_scale = _floor_two_digits(min(place.cube_half_m / room, 1.0))
     force_scale = min(
         peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N),
         _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale),
@@ -130,27 +130,27 @@ def plan_station(
     )
     shapes.move_to(place.q)
     lowest = lowest_tool_point(shapes)
-    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
+    swing = min(_MAX_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
     return StationPlan(
-        joints=tuple(model.joint_names),
-        tool=on_sensor,
-        tool_mass=mass,
-        own_tool=own_tool,
+        joint_names=tuple(model.joint_names),
+        stand_in_tool=on_sensor,
+        tool_mass_kg=mass,
+        has_own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
         force_scale=_floor_two_digits(force_scale),
-        swing=_floor_two_digits(
+        swing_amplitude_m=_floor_two_digits(
             swing * min(1.0, _MAX_SPEED_USE / _swing_speed_use(model, place, swing))
         ),
-        lowest=lowest,
-        tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
+        lowest_tool_point_W=lowest,
+        tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
-        axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
-        overlaps=tuple(overlap_texts(shapes, of_arm=True)),
-        plane=plane,
+        tool_axis_advice=tool_frame_advice(model, arm, sensor_frame, axis),
+        overlap_warnings=tuple(overlap_texts(shapes, of_arm=True)),
+        base_plane_height=plane,
         weak_joints=weak_joints,
-        shapes=shapes,
+        posture_shapes=shapes,
     )
 
 
@@ -174,11 +174,11 @@ def _find_start_and_tool_axis(
             )
         except DrakeTeleopError as error:
             errors.append(error)
-        if found and found[-1][0].score > _SUFFICIENT_SCORE:
+        if found and found[-1][0].posture_score > _SUFFICIENT_SCORE:
             break
     if not found:
         raise errors[0]
-    best = max(found, key=lambda each: each[0].score)
+    best = max(found, key=lambda each: each[0].posture_score)
     if is_stand_in:
         slave.tool = _stand_in_tool(best[1], _stand_in_length(best[2], best[1]))
     return best

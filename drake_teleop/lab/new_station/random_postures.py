@@ -67,33 +67,33 @@ class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
-        plane: height of the base plane [m].
+        plane_height: height of the base plane [m].
         tool_length: distance of the tool's end from S [m].
-        first: (3,) origin of the first joint, p_W [m].
+        first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
-        raised: (n,) True for joints above the base plane, not of a mobile base.
-        side: direction of the region about z_W, from x_W [rad].
-        removed: number of postures that each condition removed.
+        is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
+        side_rad: direction of the region about z_W, from x_W [rad].
+        removed_counts: number of postures that each condition removed.
     """
 
-    plane: float
+    plane_height: float
     tool_length: float
-    first: Array
+    first_joint_W: Array
     reach: float
-    raised: NDArray[np.bool_]
-    side: float = 0.0
-    removed: tuple[tuple[str, int], ...] = ()
+    is_joint_above_plane: NDArray[np.bool_]
+    side_rad: float = 0.0
+    removed_counts: tuple[tuple[str, int], ...] = ()
 
     @property
-    def preferred(self) -> Array:
+    def preferred_position(self) -> Array:
         """Preferred position p_WS (3,) of the sensor [m]."""
-        r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane + self.tool_length
+        r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane_height + self.tool_length
         height = max(
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
-            float(self.first[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
+            float(self.first_joint_W[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
         )
-        direction = np.array([np.cos(self.side), np.sin(self.side)])
-        return np.array([*(self.first[:2] + r * direction), height])
+        direction = np.array([np.cos(self.side_rad), np.sin(self.side_rad)])
+        return np.array([*(self.first_joint_W[:2] + r * direction), height])
 
 
 def postures_at(arm: ArmModel, q: Array) -> Postures:
@@ -191,9 +191,9 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
         np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
         / _SUFFICIENT_ELBOW_UP_SHARE
     )
-    origins = postures.origins[:, region.raised, 2]
-    low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
-    away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
+    origins = postures.origins[:, region.is_joint_above_plane, 2]
+    low = np.maximum(region.plane_height + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
+    away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
     total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
     return total
 

@@ -38,31 +38,31 @@ class Comparison:
     """Row that compares paper and reproduction.
 
     Args:
-        origin: "set" if the scenario was chosen to match the paper's value; else "found".
-        accepted: accepted range as text; empty if the value is not comparable.
-        holds: True if the value is accepted; None if it is not comparable.
+        set_or_found: "set" if the scenario was chosen to match the paper's value; else "found".
+        accepted_range: accepted range as text; empty if the value is not comparable.
+        is_accepted: True if the value is accepted; None if it is not comparable.
     """
 
-    what: str
-    paper: str
-    ours: str
-    origin: str
-    accepted: str
-    holds: bool | None
+    quantity: str
+    paper_value: str
+    reproduced_value: str
+    set_or_found: str
+    accepted_range: str
+    is_accepted: bool | None
 
     @property
     def verdict(self) -> str:
-        if self.holds is None:
+        if self.is_accepted is None:
             return "for the record"
-        words = _VERDICTS_OF_SET_VALUES if self.origin == "set" else _VERDICTS_OF_FOUND_VALUES
-        if self.paper == _NOT_REPORTED:
+        words = _VERDICTS_OF_SET_VALUES if self.set_or_found == "set" else _VERDICTS_OF_FOUND_VALUES
+        if self.paper_value == _NOT_REPORTED:
             words = _VERDICTS_OF_OUR_BOUND
-        return words[0] if self.holds else words[1]
+        return words[0] if self.is_accepted else words[1]
 
     @property
     def css_class(self) -> str:
         """CSS class of the verdict: "agrees", "differs" (highlighted) or "" (neutral)."""
-        if self.holds is False:
+        if self.is_accepted is False:
             return "differs"
         return "agrees" if self.verdict == "agrees" else ""
 
@@ -133,9 +133,9 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return a text for each value outside its accepted range."""
     return [
-        f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
+        f"{row.quantity}: {row.reproduced_value}, accepted {row.accepted_range}: {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
-        if row.holds is False
+        if row.is_accepted is False
     ]
 
 

@@ -114,7 +114,7 @@ def draw_figures(
     pictures = {
         name: scaling_figure(
             run.result.t,
-            [run.scaled[sigma][:, component] for sigma in SIGMAS],
+            [run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS],
             SIGMAS,
             symbol=symbol,
             unit=unit,
@@ -127,13 +127,13 @@ def draw_figures(
     }
     detected = summary["contact"]["detected_s"]
     pictures["fig8"] = contact_figure(
-        contact.touched.t,
-        contact.raw[:, _FORCE_Z_INDEX],
-        contact.calculated[:, _FORCE_Z_INDEX],
+        contact.contact_result.t,
+        contact.measured_wrench[:, _FORCE_Z_INDEX],
+        contact.calculated_wrench[:, _FORCE_Z_INDEX],
         symbol="$f_z$",
-        contact=contact.contact,
+        contact=contact.in_contact,
         detected_s=math.nan if detected is None else detected,
-        threshold=contact.threshold,
+        threshold=contact.threshold_N,
         turning_s=time_of_free_reversal(contact),
     )
     return pictures
@@ -168,8 +168,12 @@ def _write_results(
         ("identification", load.result, identification_scenario(force.scenario, seed)),
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
-        ("contact_transition", contact.touched, contact.scenario),
-        ("contact_transition_without_sheet", contact.free, without_leaf_spring(contact.scenario)),
+        ("contact_transition", contact.contact_result, contact.scenario),
+        (
+            "contact_transition_without_sheet",
+            contact.free_result,
+            without_leaf_spring(contact.scenario),
+        ),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
@@ -178,7 +182,7 @@ def _write_results(
     for name, picture in pictures.items():
         write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
     write_replay(
-        out / "replay.html", contact.touched, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
+        out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
     )
     figures = values_by_full_name(summary)
     write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
@@ -227,8 +231,8 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
 def _markdown_table(rows: list[Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
-        f"| {row.accepted or '–'} | {row.verdict} |"
+        f"| {row.quantity.replace('|', '&#124;')} | {row.paper_value} | {row.reproduced_value} "
+        f"| {row.set_or_found} | {row.accepted_range or '–'} | {row.verdict} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
@@ -248,7 +252,9 @@ def _print_comparison(rows: list[Comparison], out: Path) -> None:
     colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
         verdict = f"[{colours[row.css_class]}]{row.verdict}[/]"
-        table.add_row(row.what, row.paper, row.ours, row.origin, verdict)
+        table.add_row(
+            row.quantity, row.paper_value, row.reproduced_value, row.set_or_found, verdict
+        )
     console = Console()
     console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -161,14 +161,14 @@ class Study:
                 remedy="give one of the measures for an adaptive design, none for others",
             )
 
-    def size(self) -> int:
+    def num_points(self) -> int:
         if self.design == "factorial":
             return math.prod(len(factor.level_values()) for factor in self.factors)
         return self.samples
 
-    def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
+    def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
         """Raise above `MAX_RUNS` runs, or above `MAX_RUNS_WITHOUT_CONSENT` unless `yes`."""
-        runs = self.size() * self.repeats
+        runs = self.num_points() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
             what = f"{what} are too many (at most {MAX_RUNS:,})"

@@ -39,12 +39,12 @@ class Factorial:
     Attributes:
         levels: for each factor, the level (n,) of each point.
         counts: number of levels of each factor.
-        seen: (n, seeds) True where a point has a value with a seed.
+        has_value: (n, seeds) True where a point has a value with a seed.
     """
 
     levels: list[NDArray[np.int64]]
     counts: list[int]
-    seen: BooleanArray
+    has_value: BooleanArray
 
     def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
@@ -75,7 +75,7 @@ class Factorial:
         return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
     def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-        place, count = np.zeros(len(self.seen), dtype=np.int64), 1
+        place, count = np.zeros(len(self.has_value), dtype=np.int64), 1
         for factor in factors:
             place = place * self.counts[factor] + self.levels[factor]
             count *= self.counts[factor]
@@ -83,14 +83,14 @@ class Factorial:
 
     def _half_widths_of_missing_seeds(self, table: Array, weights: Array) -> Array:
         points, seeds = table.shape
-        runs = self.seen.sum(axis=1)
+        runs = self.has_value.sum(axis=1)
         freedom = runs.sum() - points - seeds + 1
         if (runs == seeds).all():
             return np.zeros(len(weights))
         # Least squares for points and zero-sum seeds; points are eliminated (Schur complement).
         zero_sum = np.vstack([np.eye(seeds - 1), -np.ones((1, seeds - 1))])
-        seen = self.seen @ zero_sum
-        left = (zero_sum.T * self.seen.sum(axis=0)) @ zero_sum - (seen.T / runs) @ seen
+        seen = self.has_value @ zero_sum
+        left = (zero_sum.T * self.has_value.sum(axis=0)) @ zero_sum - (seen.T / runs) @ seen
         if freedom < 1 or np.linalg.matrix_rank(left) < seeds - 1:
             return np.where((weights[:, runs < seeds] != 0).any(axis=1), np.nan, 0.0)
         moved = (weights / runs) @ seen
@@ -135,13 +135,13 @@ class MeanEstimate:
     """Means over seeds at n levels.
 
     Attributes:
-        mean, half: (n,) mean and half width of its interval.
-        effect_half: (n,) half width of the difference from the mean of all n levels.
+        mean, half_width: (n,) mean and half width of its interval.
+        effect_half_width: (n,) half width of the difference from the mean of all n levels.
     """
 
     mean: Array
-    half: Array
-    effect_half: Array
+    half_width: Array
+    effect_half_width: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,25 +149,26 @@ class MainEffect:
     """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: labels of the n levels, or of the n sections of a range.
-        runs: (n,) number of runs with the measure.
-        mean, half: (n,) mean over other factors and seeds, and its half width.
-        effect, effect_half: (n,) difference from the mean of all levels, and its half width.
-        why: (n,) reason of a missing value.
-        compared, left_out: number of used and unused combinations of other levels.
-        fitted: True if the values are from a regression.
+        level_names: labels of the n levels, or of the n sections of a range.
+        num_runs: (n,) number of runs with the measure.
+        mean, half_width: (n,) mean over other factors and seeds, and its half width.
+        effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
+        missing_reasons: (n,) reason of a missing value.
+        num_used_combinations: number of combinations of other levels that are used.
+        num_unused_combinations: number of the other ones.
+        is_fitted: True if the values are from a regression.
     """
 
-    names: list[str]
-    runs: NDArray[np.int64]
+    level_names: list[str]
+    num_runs: NDArray[np.int64]
     mean: Array
-    half: Array
+    half_width: Array
     effect: Array
-    effect_half: Array
-    why: list[str]
-    compared: int
-    left_out: int
-    fitted: bool
+    effect_half_width: Array
+    missing_reasons: list[str]
+    num_used_combinations: int
+    num_unused_combinations: int
+    is_fitted: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,17 +177,17 @@ class PairMeans:
 
     Attributes:
         mean: (n, m) means over other factors and seeds; nan if not comparable.
-        why: (n, m) reason of a missing value.
-        compared, left_out, fitted: see `MainEffect`.
+        missing_reasons: (n, m) reason of a missing value.
+        num_used_combinations, num_unused_combinations, is_fitted: see `MainEffect`.
     """
 
     fields: tuple[str, str]
-    names: tuple[list[str], list[str]]
+    level_names: tuple[list[str], list[str]]
     mean: Array
-    why: NDArray[Any]
-    compared: int
-    left_out: int
-    fitted: bool
+    missing_reasons: NDArray[Any]
+    num_used_combinations: int
+    num_unused_combinations: int
+    is_fitted: bool
 
 
 def estimate_means(
@@ -215,18 +216,18 @@ def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
             "measure": measure,
             "factor": field,
             "level": name,
-            "runs": int(found.runs[index]),
+            "runs": int(found.num_runs[index]),
             "mean": found.mean[index],
-            "mean_half": found.half[index],
+            "mean_half": found.half_width[index],
             "effect": found.effect[index],
-            "effect_half": found.effect_half[index],
-            "combinations": found.compared,
-            "left_out": found.left_out,
-            "why": found.why[index] or None,
+            "effect_half": found.effect_half_width[index],
+            "combinations": found.num_used_combinations,
+            "left_out": found.num_unused_combinations,
+            "why": found.missing_reasons[index] or None,
         }
         for measure in study.measures
         for field, found in main_effects(study, rows, measure).items()
-        for index, name in enumerate(found.names)
+        for index, name in enumerate(found.level_names)
     ]
     return pl.DataFrame(table)
 
@@ -262,8 +263,8 @@ class _MeasureData:
         ]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
-            index = [levels.index[known] for levels in self.levels]
-            counts = [len(levels.names) for levels in self.levels]
+            index = [levels.level_of_points[known] for levels in self.levels]
+            counts = [len(levels.level_names) for levels in self.levels]
             self.model = Factorial(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
@@ -272,7 +273,7 @@ class _MeasureData:
 
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
-        count = len(levels.names)
+        count = len(levels.level_names)
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
@@ -282,39 +283,45 @@ class _MeasureData:
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
                 compared = self._count_combinations(combinations, factor)
-            why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
-        runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
+            why = self._missing_value_reasons(
+                is_compared & (is_compared.sum() > 1), levels.level_of_points
+            )
+        runs = np.bincount(levels.level_of_points, self.runs, count).astype(np.int64)
         left_out = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
-            self.fitted,
+            levels.level_names, runs, mean, half, effect, effect_half, why, compared, left_out,
+            self.is_fitted,
         )  # fmt: skip
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
-        if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
+        if self.model is None or (
+            isinstance(self.model, LevelModel) and not self.model.product_columns
+        ):
             return None
         a, b = self.levels[first], self.levels[second]
-        shape = len(a.names), len(b.names)
+        shape = len(a.level_names), len(b.level_names)
         is_compared, combinations, weights = self.model.comparable_levels(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
-        cell = a.index * shape[1] + b.index
+        cell = a.level_of_points * shape[1] + b.level_of_points
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
         why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
         compared = self._count_combinations(combinations, first, second)
         left_out = self._count_combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
-        names = a.names, b.names
-        return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
+        names = a.level_names, b.level_names
+        return PairMeans(
+            fields, names, mean.reshape(shape), why, compared, left_out, self.is_fitted
+        )
 
     @property
-    def fitted(self) -> bool:
+    def is_fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
     def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
-        others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
+        others = (len(f.level_names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(combinations) * math.prod(others))
 
     def _missing_value_reasons(self, compared: BooleanArray, cell: NDArray[np.int64]) -> list[str]:
@@ -347,7 +354,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
         complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
         found = estimate_means(values, index, seeds, len(order))
         points = points.with_columns(
-            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half)
+            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half_width)
         )
         means.append(found.mean)
     return points.with_columns(

@@ -62,19 +62,18 @@ class FactorLevels:
     """Levels of a factor at n points.
 
     Attributes:
-        index: (n,) level of each point.
-        names: labels of the levels with a point.
-        within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
-        centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
-            one.
-        middles: (levels, k) these columns at the middle of each level.
+        level_of_points: (n,) level of each point.
+        level_names: labels of the levels with a point.
+        position_in_section: (n,) from -1/2 to 1/2 in a section of a range; None for a list.
+        regression_columns: (n, k) with zero mean: numbers, or indicators of all values but one.
+        columns_at_middles: (levels, k) these columns at the middle of each level.
     """
 
-    index: NDArray[np.int64]
-    names: list[str]
-    within: Array | None
-    centred: Array
-    middles: Array
+    level_of_points: NDArray[np.int64]
+    level_names: list[str]
+    position_in_section: Array | None
+    regression_columns: Array
+    columns_at_middles: Array
 
 
 def levels_of_factor_values(
@@ -105,32 +104,32 @@ class LevelModel:
     """Linear regression of a measure on the levels of all factors.
 
     Attributes:
-        codes: for each factor, the columns (levels, k) of its levels.
-        products: columns of X for each pair (i, j) of factors.
-        failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
-        X: (n, p) design matrix; first column: the mean.
-        solve: (p, n) pseudo-inverse of X.
+        effect_codes: for each factor, the columns (levels, k) of its levels.
+        product_columns: columns of X for each pair (i, j) of factors.
+        failed_cells: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
+        design_matrix: (n, p) design matrix; first column: the mean.
+        pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
     factors: list[FactorLevels]
-    codes: list[Array]
-    products: dict[tuple[int, int], slice]
-    failed: dict[tuple[int, int], BooleanArray]
-    X: Array
-    solve: Array
+    effect_codes: list[Array]
+    product_columns: dict[tuple[int, int], slice]
+    failed_cells: dict[tuple[int, int], BooleanArray]
+    design_matrix: Array
+    pseudo_inverse: Array
 
     def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `Factorial`, but with a matrix from coefficients to means."""
-        others = sorted(set(itertools.chain(*self.failed)) - set(shown))
+        others = sorted(set(itertools.chain(*self.failed_cells)) - set(shown))
         factors = [*shown, *others]
-        shape = [len(self.factors[factor].names) for factor in factors]
+        shape = [len(self.factors[factor].level_names) for factor in factors]
         at = dict(zip(factors, np.indices(shape).reshape(len(shape), -1), strict=True))
         there = np.ones(math.prod(shape), dtype=bool)
-        for (i, j), failed in self.failed.items():
+        for (i, j), failed in self.failed_cells.items():
             there &= ~failed[at[i], at[j]]
         count = math.prod(shape[: len(shown)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
-        terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
+        terms = self._regression_terms(at).reshape(count, -1, self.design_matrix.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
@@ -139,7 +138,7 @@ class LevelModel:
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
         coefficients, design = (
-            self.solve @ table.mean(axis=1),
+            self.pseudo_inverse @ table.mean(axis=1),
             self._half_width_over_points(table, num_effects),
         )
         effects, halves = [], []
@@ -156,7 +155,7 @@ class LevelModel:
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
         seeds = table.shape[1]
-        each = terms @ self.solve @ table
+        each = terms @ self.pseudo_inverse @ table
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
@@ -166,30 +165,33 @@ class LevelModel:
 
     def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))
-        terms, first = np.zeros((count, self.X.shape[1])), 1
+        terms, first = np.zeros((count, self.design_matrix.shape[1])), 1
         terms[:, 0] = 1.0
-        for factor, codes in enumerate(self.codes):
+        for factor, codes in enumerate(self.effect_codes):
             if factor in at:
                 terms[:, first : first + codes.shape[1]] = codes[at[factor]]
             first += codes.shape[1]
-        for (i, j), columns in self.products.items():
+        for (i, j), columns in self.product_columns.items():
             if i in at and j in at:
-                a, b = self.factors[i].middles[at[i]], self.factors[j].middles[at[j]]
+                a, b = (
+                    self.factors[i].columns_at_middles[at[i]],
+                    self.factors[j].columns_at_middles[at[j]],
+                )
                 terms[:, columns] = _column_products(a, b)
         return terms
 
     @property
     def _degrees_of_freedom(self) -> int:
-        return self.X.shape[0] - self.X.shape[1]
+        return self.design_matrix.shape[0] - self.design_matrix.shape[1]
 
     def _residual_variance(self, table: Array, columns: int) -> float:
-        residuals = table - self.X @ (self.solve @ table)
+        residuals = table - self.design_matrix @ (self.pseudo_inverse @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
 
     def _relative_deviations(self, terms: Array) -> Array:
-        return np.linalg.norm(terms @ self.solve, axis=1)
+        return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, together: int) -> float:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
@@ -200,7 +202,7 @@ class LevelModel:
         if seeds == 1:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
-        moved = np.sum((terms @ self.solve @ apart) ** 2) / (seeds - 1)
+        moved = np.sum((terms @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
         noise = self._residual_variance(apart, seeds - 1) * np.sum(
             self._relative_deviations(terms) ** 2
         )
@@ -228,7 +230,7 @@ def fit_level_model(
         model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model
-            if model.X.shape[1] <= len(model.X) / 2:
+            if model.design_matrix.shape[1] <= len(model.design_matrix) / 2:
                 break
     return found
 
@@ -238,18 +240,25 @@ def _build_model(
 ) -> LevelModel | None:
     points = int(known.sum())
     failed = _failed_cells(factors, known, by_chance)
-    codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
+    codes = [
+        _effect_codes(len(levels.level_names), np.unique(levels.level_of_points[known]))
+        for levels in factors
+    ]
     columns = [np.ones((points, 1))]
-    columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
-    columns += [f.within[known, None] for f in factors if f.within is not None]
+    columns += [code[f.level_of_points[known]] for f, code in zip(factors, codes, strict=True)]
+    columns += [
+        f.position_in_section[known, None] for f in factors if f.position_in_section is not None
+    ]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _column_products(factors[i].centred[known], factors[j].centred[known])
+        pair = _column_products(
+            factors[i].regression_columns[known], factors[j].regression_columns[known]
+        )
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)
-    counts = sorted(len(levels.names) for levels in factors)
-    involved = [len(factors[k].names) for k in set(itertools.chain(*failed))] + counts[-2:]
+    counts = sorted(len(levels.level_names) for levels in factors)
+    involved = [len(factors[k].level_names) for k in set(itertools.chain(*failed))] + counts[-2:]
     if X.shape[1] >= points or math.prod(involved) > _MAX_COMBINATIONS:
         return None
     u, size, v = np.linalg.svd(X, full_matrices=False)
@@ -264,9 +273,9 @@ def _failed_cells(
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
-        tried, good = np.zeros((2, len(a.names), len(b.names)))
-        np.add.at(tried, (a.index, b.index), 1.0)
-        np.add.at(good, (a.index[known], b.index[known]), 1.0)
+        tried, good = np.zeros((2, len(a.level_names), len(b.level_names)))
+        np.add.at(tried, (a.level_of_points, b.level_of_points), 1.0)
+        np.add.at(good, (a.level_of_points[known], b.level_of_points[known]), 1.0)
         failed = good == 0
         if by_chance:
             share = good / np.maximum(tried, 1.0)

@@ -69,8 +69,8 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
                 _draw_levels(axes, found[factor.field])
-                fitted |= found[factor.field].fitted
-                reasons |= set(found[factor.field].why)
+                fitted |= found[factor.field].is_fitted
+                reasons |= set(found[factor.field].missing_reasons)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
             line[0].set_ylabel("\n".join(words).replace(" ", ""), fontsize=7)
         for axes, factor in zip(grid[-1], factors, strict=True):
@@ -81,17 +81,17 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
 
 
 def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
-    place = np.arange(len(found.names))
-    bars = np.nan_to_num(found.effect_half)
+    place = np.arange(len(found.level_names))
+    bars = np.nan_to_num(found.effect_half_width)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    _label_levels(axes, found.names)
+    _label_levels(axes, found.level_names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched_cell(found.why[level], (level - 0.5, 0.0))
+        bar = _hatched_cell(found.missing_reasons[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
-        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.why else ""
+        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.missing_reasons else ""
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
@@ -106,9 +106,10 @@ def _label_levels(axes: Axes, levels: list[str]) -> None:
 
 
 def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    if not found.left_out:
+    if not found.num_unused_combinations:
         return ""
-    return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
+    used, unused = found.num_used_combinations, found.num_unused_combinations
+    return f"over {used} of {used + unused} combinations of the rest"
 
 
 def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
@@ -135,19 +136,21 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
-                axes.add_patch(_hatched_cell(found.why[row, column], (column - 0.5, row - 0.5)))
+                axes.add_patch(
+                    _hatched_cell(found.missing_reasons[row, column], (column - 0.5, row - 0.5))
+                )
             axes.grid(False)
-            _label_levels(axes, found.names[1])
-            axes.set_yticks(range(len(found.names[0])), found.names[0])
+            _label_levels(axes, found.level_names[1])
+            axes.set_yticks(range(len(found.level_names[0])), found.level_names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
             axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
-        words = ", fitted: levels of each, and products" if maps[0].fitted else ""
+        words = ", fitted: levels of each, and products" if maps[0].is_fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
-        _draw_reason_legend(figure, set().union(*(found.why.ravel() for found in maps)))
+        _draw_reason_legend(figure, set().union(*(found.missing_reasons.ravel() for found in maps)))
     return figure
 
 

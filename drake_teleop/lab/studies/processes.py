@@ -27,10 +27,10 @@ RunRows: TypeAlias = Callable[[Chunk], Chunk]
 
 @dataclass(frozen=True)
 class RunExecutor:
-    """Executor of `count` runs at once; `rows_of` yields finished chunks (groups of rows)."""
+    """Executor of `num_workers` runs at once; `run_chunks` yields finished chunks."""
 
-    count: int
-    rows_of: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
+    num_workers: int
+    run_chunks: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 
 
 PROCESS_ENDED_ERROR = "the run has ended its process"

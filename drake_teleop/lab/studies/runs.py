@@ -81,7 +81,7 @@ def run_study(
         if part is None
         else part.chunks(_group_into_chunks(first_rows))
     )
-    total = sum(map(len, chunks)) if part else study.size() * study.repeats
+    total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
         if merge:
             merge_shards(out, store, identity, chunks)
@@ -91,13 +91,13 @@ def run_study(
                 show_progress(progress) as stage,
                 open_executor(store, jobs, cluster, executor) as workers,
             ):
-                counter.start(stage("Study"), workers.count)
+                counter.start(stage("Study"), workers.num_workers)
                 new = points
                 while new:
                     finished = store.finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
-                    for found in workers.rows_of(run, left):
+                    for found in workers.run_chunks(run, left):
                         _store_rows(store, found, schema)
                         counter.add_finished_runs(found)
                     new = study.next_points(points, _objective_of_points(study, store, len(points)))

@@ -61,16 +61,16 @@ class ScaleRating:
 
     Attributes:
         merit: mean relative criterion, below 1 is better; nan with too many failures.
-        low, high: limits of the merit's 95 % interval.
-        best: share of bootstrap draws in which the point is the best.
-        failures: share of failed runs in the worst task.
+        merit_low, merit_high: limits of the merit's 95 % interval.
+        best_share: share of bootstrap draws in which the point is the best.
+        failure_share: share of failed runs in the worst task.
     """
 
     merit: Array
-    low: Array
-    high: Array
-    best: Array
-    failures: Array
+    merit_low: Array
+    merit_high: Array
+    best_share: Array
+    failure_share: Array
 
 
 def scaling_study_command(
@@ -186,15 +186,15 @@ def _best_scales(
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best >= _MIN_BEST_SHARE)
+    near = np.argwhere(found.best_share >= _MIN_BEST_SHARE)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
         "merit": found.merit[s, g],
-        "interval": [found.low[s, g], found.high[s, g]],
-        "best_in": found.best[s, g],
+        "interval": [found.merit_low[s, g], found.merit_high[s, g]],
+        "best_in": found.best_share[s, g],
         "others": [
-            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best[i, j]}
+            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best_share[i, j]}
             for i, j in near
             if (i, j) != (s, g)
         ],
@@ -213,9 +213,9 @@ def _merit_table(
                 "sigma": sigma,
                 "gamma": gamma,
                 "merit": found.merit[i, j],
-                "low": found.low[i, j],
-                "high": found.high[i, j],
-                "best_in": found.best[i, j],
+                "low": found.merit_low[i, j],
+                "high": found.merit_high[i, j],
+                "best_in": found.best_share[i, j],
             }
             for selection, found in answers.items()
             for i, sigma in enumerate(sigmas)
@@ -232,7 +232,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     for measure in ("success", *MEASURE_OF_CRITERION.values(), "detection_time_s"):
         found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
         for index, row in enumerate(table):
-            figures = (found.mean[index], found.half[index], found.effect_half[index])
+            figures = (found.mean[index], found.half_width[index], found.effect_half_width[index])
             names = (measure, f"{measure}_half", f"{measure}_effect_half")
             row |= {n: v if np.isfinite(v) else None for n, v in zip(names, figures, strict=True)}
     return table
@@ -252,7 +252,9 @@ def draw_criteria(
                 found = estimate_means(
                     measure_values(table, measure), levels, seeds, levels.max() + 1
                 )
-                means, bars = (a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half))
+                means, bars = (
+                    a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half_width)
+                )
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
                         sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],
@@ -303,8 +305,8 @@ def draw_best_scales(
 
 def _cell_text(found: ScaleRating, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
-        return f"{found.failures[i, j]:.0%} fail"
-    best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""
+        return f"{found.failure_share[i, j]:.0%} fail"
+    best = f"\nbest: {found.best_share[i, j]:.0%}" if found.best_share[i, j] >= 0.005 else ""
     return f"{found.merit[i, j]:.2f}{best}"
 
 

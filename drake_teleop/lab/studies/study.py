@@ -38,27 +38,27 @@ class StationWork:
     """Picklable function that executes one run of the station for a study.
 
     Args:
-        data: content of the base scenario's file.
-        where: name of that file, for messages.
+        scenario_data: content of the base scenario's file.
+        scenario_file: name of that file, for messages.
         measures: names of the measures.
-        threshold: force [N] of time_above_force_s.
+        force_threshold_N: force [N] of time_above_force_s.
     """
 
-    data: Any
-    where: str
+    scenario_data: Any
+    scenario_file: str
     measures: Sequence[str]
-    threshold: float
+    force_threshold_N: float
 
     def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_apply_changes(self.data, changes), self.where)
+        return ScenarioFromData(_apply_changes(self.scenario_data, changes), self.scenario_file)
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
         one_time_s = time.monotonic() - start - simulated / run.real_time_factor
-        found = evaluate_measures(run.result, scenario, self.measures, self.threshold)
+        found = evaluate_measures(run.result, scenario, self.measures, self.force_threshold_N)
         return found | {ONE_TIME_COST_KEY: max(one_time_s, 0.0)}
 
 
@@ -94,7 +94,7 @@ def study_command(
             )
     study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
-    study.check_size(str(path), yes)
+    study.check_num_runs(str(path), yes)
     data, where = ReadScenario(_scenario_path(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):

@@ -102,23 +102,23 @@ class StationTrial:
     """Function that a study runs: one press in the whole station.
 
     Args:
-        given: scenario of the user, with its own passivity and scales.
-        base: the same without environment, task and passivity method.
-        estimate: (16,) load estimate.
+        user_scenario: scenario of the user, with its own passivity and scales.
+        base_scenario: the same without environment, task and passivity method.
+        load_estimate: (16,) load estimate.
     """
 
-    given: Scenario
-    base: Scenario
-    stated: StatedSet
-    estimate: Array
+    user_scenario: Scenario
+    base_scenario: Scenario
+    stated_set: StatedSet
+    load_estimate: Array
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
-        scenario = self.given
+        scenario = self.user_scenario
         if values["method"] != GIVEN_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base, self.stated)
+            scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base.channel
+        channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
@@ -126,21 +126,21 @@ class StationTrial:
             scenario.passivity,
             wall,
             task=task,
-            depth=press_depth(self.base, grip),
+            depth=press_depth(self.base_scenario, grip),
         )
         setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
-        station = MakeTeleopStation(setup, load_estimate=self.estimate)
+        station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
             return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
         found = figures_of_station_run(result, setup, task)
-        hold = (result.t >= task.release - task.judged) & (result.t < task.release)
+        hold = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
         scaling = scenario.force_scaling
         gain = scaling.force_scale * scaling.scales().gamma
         contact = float(result["true_contact_wrench_W"][hold, 2].mean())
         felt = result["force_to_master"][hold, 2]
-        free = (result.t >= task.swung + _HAND_SETTLE_TIME_S) & (result.t < task.press)
+        free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
@@ -148,7 +148,7 @@ class StationTrial:
             *(rms_above_frequency(force, period, REST_BAND_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
-        human = self.base.operator.perception
+        human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
             "rests": float(found.stable),
@@ -164,19 +164,22 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `caps`: low-pass [Hz] -> upper bound of gamma.
+    `max_gamma_of_low_pass`: low-pass [Hz] -> upper bound of gamma.
     """
 
-    base: Scenario
-    stated: StatedSet
-    caps: dict[float, float]
+    base_scenario: Scenario
+    stated_set: StatedSet
+    max_gamma_of_low_pass: dict[float, float]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
-        axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
+        axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = self.caps[settings.low_pass_hz] * self.stated.requirements.margin
+        cap = (
+            self.max_gamma_of_low_pass[settings.low_pass_hz]
+            * self.stated_set.requirements.gamma_margin
+        )
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -185,7 +188,7 @@ class GammaSearch:
             gamma = float(np.exp(log_gamma))
             found = [
                 self.rendered_share_in_one_axis(axis, settings, gamma, *c, seed)
-                for c in self.stated.corners
+                for c in self.stated_set.corners
             ]
             shares[gamma] = min(found)
             return 1.0 if shares[gamma] >= MIN_RENDERED_SHARE else -1.0
@@ -204,11 +207,11 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
-        sampling = sampling_of_scenario(self.base)
+        sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
-        for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
+        for grip, wall in [*self.stated_set.corners, (self.stated_set.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
@@ -224,7 +227,7 @@ class GammaSearch:
         seed: int,
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
-        forward, backward = self.base.channel.networks_of_directions()
+        forward, backward = self.base_scenario.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
         shown = {
             entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
@@ -233,18 +236,22 @@ class GammaSearch:
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        added = (
+            0.0
+            if self.base_scenario.wrist_sensor.ideal
+            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        )
         task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
-            settings.passivity(self.stated),
+            settings.passivity(self.stated_set),
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,
             intent=operator_intent(task),
         )
         found = figures_of_run(run, model, task)
-        hold = (run.t >= task.release - task.judged) & (run.t < task.release)
+        hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
         quiet = (
             rms_above_frequency(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ)
             <= MAX_REST_FORCE_N
@@ -257,14 +264,14 @@ def short_press_task(round_trip: float) -> Task:
     pressed = 1.8 + 2 * round_trip
     release = pressed + _PRESS_SETTLE_TIME_S + _REST_WINDOW_S + 2 * round_trip
     return Task(
-        swing=0.1,
-        swung=0.8,
-        press=pressed - 0.5,
-        pressed=pressed,
-        release=release,
-        released=release + 0.1,
+        swing_start=0.1,
+        swing_end=0.8,
+        press_start=pressed - 0.5,
+        press_end=pressed,
+        release_start=release,
+        release_end=release + 0.1,
         end=release,
-        judged=_REST_WINDOW_S,
+        rest_window=_REST_WINDOW_S,
     )
 
 
