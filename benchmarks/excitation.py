@@ -33,7 +33,7 @@ from drake_teleop.lab.excitation.excite import (
     sensor_motion,
 )
 from drake_teleop.lab.excitation.optimizer import (
-    LIMIT_SHARE,
+    USABLE_LIMIT_SHARE,
     DesignProblem,
     DesignTask,
     minimise_criterion,
@@ -114,7 +114,10 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda x: LIMIT_SHARE - evaluate(x).limit_uses},
+            constraints={
+                "type": "ineq",
+                "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).limit_uses,
+            },
             options={"maxiter": 1000},
         )
     return best

@@ -21,7 +21,7 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
-from drake_teleop.lab.excitation.motion_film import write_motion_replay
+from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench

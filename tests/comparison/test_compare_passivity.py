@@ -126,7 +126,11 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     )
     study._run_station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]
-    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RUN_RATES)
+    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
+        0.3,
+        3,
+        study._STATION_RATES,
+    )
     assert base.surroundings is None and base.contact_detection is None
     # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"

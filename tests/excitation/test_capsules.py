@@ -11,7 +11,7 @@ from pydrake.geometry import Box, Cylinder, GeometryId
 from pydrake.geometry import Capsule as CapsuleShape
 
 from drake_teleop.lab.excitation.collision import (
-    CLEARANCE_M,
+    MIN_CLEARANCE_M,
     Capsule,
     _exclude_coaxial_pairs,
     _required_capsule_distance,
@@ -66,7 +66,7 @@ def test_minimum_distance_subtracts_the_quartile_of_the_excess():
     kept = _required_capsule_distance(
         np.concatenate([touching, far]), np.concatenate([nearer, far])
     )
-    assert kept == pytest.approx(CLEARANCE_M - 0.025)
+    assert kept == pytest.approx(MIN_CLEARANCE_M - 0.025)
     # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
     assert _required_capsule_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)

@@ -30,7 +30,7 @@ from drake_teleop.lab.excitation.limits import (
     write_link_motions,
     write_sensor_motion,
 )
-from drake_teleop.lab.excitation.motion_film import write_motion_replay
+from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.optimizer import Iterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario

@@ -59,7 +59,7 @@ import json, os, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 import test_shards as shards
-shards.runs._NUM_CHUNKS = 20
+shards.runs._TARGET_NUM_CHUNKS = 20
 
 def run(number, last):
     left = [last]

@@ -56,7 +56,7 @@ import joblib, polars
 from drake_teleop.lab.studies import runs
 from drake_teleop.lab.studies.design import Factor, Study
 
-runs._NUM_CHUNKS = 150  # as many runs in a part as a larger study has
+runs._TARGET_NUM_CHUNKS = 150  # as many runs in a part as a larger study has
 
 def work(values, seed):
     time.sleep(pause)
@@ -227,7 +227,7 @@ def test_error_without_dask_names_the_extra(files, monkeypatch):
 
 @pytest.mark.slow
 def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
-    out, work, calls = files / "stopped", studies.StationWork.__call__, []
+    out, work, calls = files / "stopped", studies.StationRunFunction.__call__, []
 
     def stopping(self, values, seed):
         calls.append(seed)
@@ -235,7 +235,7 @@ def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
             raise KeyboardInterrupt
         return work(self, values, seed)
 
-    monkeypatch.setattr(studies.StationWork, "__call__", stopping)
+    monkeypatch.setattr(studies.StationRunFunction, "__call__", stopping)
     with pytest.raises(KeyboardInterrupt, match="keeps 5 of 12 runs"):
         study_command(files / "study.yaml", out, jobs=1, quiet=True)
     assert study_command(files / "study.yaml", out, jobs=1, quiet=True) == serial[0]
@@ -571,7 +571,7 @@ def test_measures_of_a_known_motion():
 
 
 def test_preset_as_factor_sets_its_values():
-    work = studies.StationWork({}, "x", (), 1.0)
+    work = studies.StationRunFunction({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
     assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor

@@ -61,7 +61,7 @@ NETWORK_IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
 SIGMAS = (0.0, 1.0)
 _INJECTED_ENERGY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
-_RUN_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_STATION_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_STEP_S = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
@@ -153,7 +153,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP_S),
-        rates=_RUN_RATES,
+        rates=_STATION_RATES,
         contact_detection=None,
     )
 

@@ -152,7 +152,7 @@ class DesignProblem:
 
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
-LIMIT_SHARE = 0.985
+USABLE_LIMIT_SHARE = 0.985
 # Largest use of a feasible iterate on the grid.
 _MAX_FEASIBLE_USE = 0.9885
 
@@ -279,7 +279,7 @@ class _DescentSearch:
             constraints={
                 "type": "ineq",
                 "fun": lambda x, *sharpness: (
-                    LIMIT_SHARE - self._evaluate_once(x, *sharpness).limit_uses
+                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).limit_uses
                 ),
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (criterion_sharpness, limit_sharpness),
@@ -292,7 +292,7 @@ class _DescentSearch:
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
-        excess = np.maximum(point.limit_uses - LIMIT_SHARE, 0)
+        excess = np.maximum(point.limit_uses - USABLE_LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 

@@ -32,7 +32,7 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
-_PHANTOM_HALF_SIZE_M = 0.08
+_PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
@@ -120,7 +120,7 @@ def plan_station(
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
-    room = _PHANTOM_HALF_SIZE_M if figures is None else min(figures.size) / 2.0
+    room = _PHANTOM_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
     translation_scale = _floor_two_digits(min(place.cube_half_m / room, 1.0))
     force_scale = min(

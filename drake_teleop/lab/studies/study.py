@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StationWork:
+class StationRunFunction:
     """Picklable function that executes one run of the station for a study.
 
     Args:
@@ -99,7 +99,7 @@ def study_command(
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_factor_values(factor, f"{path}:factors[{index}]")
-    work = StationWork(data, where, tuple(study.measures), study.force_threshold)
+    work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
         study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
