@@ -300,7 +300,7 @@ def eigenvalues_agree(axis: OneAxis, sampling: Sampling, found: StabilityMap) ->
     rng, same = np.random.default_rng(1), 0
     for i, j in rng.integers(N, size=(CELLS, 2)):
         cell, rates = axis, sampling
-        for name, value in ((found.x_name, found.x_values[j]), (found.y_name, found.y_values[i])):
+        for name, value in ((found.x_name, found.x[j]), (found.y_name, found.y[i])):
             if name == "rate":
                 rates = replace(rates, hand_hz=value, joint_control_hz=value, sensor_hz=4 * value)
             else:

@@ -79,8 +79,8 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
     axis, sampling, found = drawn
     assert 0 < found.stable.sum() < found.stable.size
     rng = np.random.default_rng(1)
-    for i, j in rng.integers((len(found.y_values), len(found.x_values)), size=(6, 2)):
-        cell = {found.x_name: found.x_values[j], found.y_name: found.y_values[i]}
+    for i, j in rng.integers((len(found.y), len(found.x)), size=(6, 2)):
+        cell = {found.x_name: found.x[j], found.y_name: found.y[i]}
         assert grows(axis, sampling, **cell) == (found.num_unstable_multipliers[i, j] > 0), cell
 
 
@@ -90,13 +90,9 @@ def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
     """Along the parameter other than delay, at whole periods of delay."""
     axis, sampling, found = drawn
     x, y = found.boundary.T
-    moved, fixed = (
-        (found.y_name, found.x_values)
-        if found.x_name != "sigma"
-        else (found.x_name, found.y_values)
-    )
+    moved, fixed = (found.y_name, found.x) if found.x_name != "sigma" else (found.x_name, found.y)
     if found.x_name == "mass_error":
-        moved, fixed = "mass_error", found.y_values
+        moved, fixed = "mass_error", found.y
     other = y if moved == found.x_name else x
     points = found.boundary[np.isin(other, fixed)]
     assert len(points) > 3
@@ -136,7 +132,7 @@ def test_displayed_tool_increases_the_delay_margin_in_contact() -> None:
     found = stability_map(
         MEDIUM, Sampling(), "delay", np.linspace(0, 0.05, 60), "sigma", np.array([0, 0.25, 0.5, 1])
     )
-    margins = [found.boundary[found.boundary[:, 1] == sigma, 0] for sigma in found.y_values]
+    margins = [found.boundary[found.boundary[:, 1] == sigma, 0] for sigma in found.y]
     assert [len(margin) for margin in margins] == [1, 1, 1, 1]
     assert (np.diff(np.concatenate(margins)) > 0).all()
 

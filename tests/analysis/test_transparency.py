@@ -92,23 +92,21 @@ def test_apparent_mass_in_free_motion_follows_the_scales(sigma):
 def test_transmitted_width_agrees_with_solved_equations():
     width = tr.transmitted_z_width(tp.hybrid_matrix(AXIS, S))
     np.testing.assert_allclose(
-        width.free_impedance,
+        width.free,
         solved("hand", 0.0, OneAxis(**{**AXIS.__dict__, "wall_damping": 0.0})),
         rtol=1e-9,
     )
-    np.testing.assert_allclose(width.rigid_impedance, solved("hand", 1e18), rtol=1e-9)
+    np.testing.assert_allclose(width.rigid, solved("hand", 1e18), rtol=1e-9)
     np.testing.assert_allclose(
-        width.decades, np.log10(np.abs(width.rigid_impedance / width.free_impedance)), rtol=1e-12
+        width.decades, np.log10(np.abs(width.rigid / width.free)), rtol=1e-12
     )
     # At low frequency a rigid wall has the scaled stiffness of the servo.
     axis = OneAxis()
-    rigid = tr.transmitted_z_width(tp.hybrid_matrix(axis, np.array([1e-3j]))).rigid_impedance
+    rigid = tr.transmitted_z_width(tp.hybrid_matrix(axis, np.array([1e-3j]))).rigid
     spring = axis.slave_mass * axis.velocity_gain * axis.position_gain
     assert -rigid.imag * 1e-3 == pytest.approx(spring * axis.force_scale, rel=1e-6)
     assert np.all(
-        np.isinf(
-            tr.transmitted_z_width(tp.hybrid_matrix(OneAxis(ideal_servo=True), S)).rigid_impedance
-        )
+        np.isinf(tr.transmitted_z_width(tp.hybrid_matrix(OneAxis(ideal_servo=True), S)).rigid)
     )
 
 

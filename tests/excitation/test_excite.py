@@ -238,8 +238,8 @@ def test_check_finds_a_violation_of_each_limit(slave, short):
         "position": {"q_half": 0.99 * uses["position"] * limits.q_half},
         "velocity": {"velocity": 0.99 * uses["velocity"] * limits.velocity},
         "acceleration": {"acceleration": 0.99 * uses["acceleration"] * limits.acceleration},
-        "torque": {"effort": 0.99 * uses["torque"] * limits.max_torques},
-        "sensor": {"sensor": 0.99 * uses["sensor"] * limits.max_sensor_norms},
+        "torque": {"max_torques": 0.99 * uses["torque"] * limits.max_torques},
+        "sensor": {"max_sensor_norms": 0.99 * uses["sensor"] * limits.max_sensor_norms},
         "workspace": {"box_half": 0.99 * uses["workspace"] * limits.box_half},
         "clearance": {"clearance": 1.01 * distance},
     }

@@ -248,7 +248,7 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.array([next(numbers)]),
         evaluate=lambda x, *sharpness: SimpleNamespace(
-            log_criterion=0.01 * x[0], uses=np.full(2, uses.get(x[0], 0.9))
+            log_criterion=0.01 * x[0], limit_uses=np.full(2, uses.get(x[0], 0.9))
         ),
     )
     search = _DescentSearch(problem, 1, None, lambda *_: None)
@@ -260,7 +260,7 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
     values = iter([3.0, 2.0, 2.5, 1.5])
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.zeros(1),
-        evaluate=lambda x, *sharpness: SimpleNamespace(largest_use=0.5),
+        evaluate=lambda x, *sharpness: SimpleNamespace(largest_limit_use=0.5),
         value=lambda: next(values),
         trajectory=lambda x: int(x[0]),
     )

@@ -340,8 +340,10 @@ def test_elimination_removes_the_reaction_force_of_the_plant(ideal_run):
 def test_ideal_run_rejects_each_wrong_sign_of_the_regressor(ideal_run, monkeypatch):
     """Wrong signs in the regressor, and in the elimination's own function."""
     sparse = slice(None, None, 20)
-    motion = tuple(part[sparse] for part in ideal_run.motion)
-    run = dataclasses.replace(ideal_run, reaction=ideal_run.reaction[sparse], motion=motion)
+    motion = tuple(part[sparse] for part in ideal_run.sensor_motion)
+    run = dataclasses.replace(
+        ideal_run, weld_reaction=ideal_run.weld_reaction[sparse], sensor_motion=motion
+    )
     mutants = mutants_of_regressor()
     assert len(mutants) == 54
     for place, into in mutants.items():
@@ -376,7 +378,7 @@ def test_wrong_mass_increases_the_residual():
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
     motion = simulate_free_motion(scenario, estimate, lambda done: None)
-    assert tuple(motion.scaled) == SIGMAS
+    assert tuple(motion.scaled_wrenches) == SIGMAS
     figures = free_values(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

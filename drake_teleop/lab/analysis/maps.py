@@ -43,8 +43,8 @@ class StabilityMap:
 
     x_name: str
     y_name: str
-    x_values: Array  #: (nx,) values of the first parameter
-    y_values: Array  #: (ny,) values of the second parameter
+    x: Array  #: (nx,) values of the first parameter
+    y: Array  #: (ny,) values of the second parameter
     num_unstable_multipliers: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
     distortion: Array  #: (ny, nx), valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step

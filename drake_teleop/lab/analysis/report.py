@@ -224,15 +224,13 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         left, right = figure.subplots(1, 2)
         left.fill_between(
             hertz,
-            np.abs(width.free_impedance),
-            np.abs(width.rigid_impedance),
+            np.abs(width.free),
+            np.abs(width.rigid),
             color=COLOURS[5],
             alpha=0.35,
         )
-        left.loglog(
-            hertz, np.abs(width.rigid_impedance), color=COLOURS[0], label="rigid environment"
-        )
-        left.loglog(hertz, np.abs(width.free_impedance), color=COLOURS[2], label="free motion")
+        left.loglog(hertz, np.abs(width.rigid), color=COLOURS[0], label="rigid environment")
+        left.loglog(hertz, np.abs(width.free), color=COLOURS[2], label="free motion")
         left.set_xlabel("frequency [Hz]")
         left.set_ylabel("|Z| displayed [N s/m]")
         left.set_title("Transmitted through the station")
@@ -276,7 +274,7 @@ def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
 def _draw_stability_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
     one = shown[grip]
     (x_label, x_factor), (y_label, y_factor) = _AXIS_LABELS[one.x_name], _AXIS_LABELS[one.y_name]
-    x, y = x_factor * one.x_values, y_factor * one.y_values
+    x, y = x_factor * one.x, y_factor * one.y
     distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
     axes.set_facecolor("#D5D8DD")
     mesh = axes.pcolormesh(

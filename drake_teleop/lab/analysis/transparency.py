@@ -45,13 +45,13 @@ def fit_apparent_impedance(felt: Complex, omega: RealArray) -> ApparentImpedance
 class ZWidth(NamedTuple):
     """Impedances displayed in free motion and at a rigid wall [N s/m]."""
 
-    free_impedance: Complex
-    rigid_impedance: Complex
+    free: Complex
+    rigid: Complex
 
     @property
     def decades(self) -> RealArray:
         """Dynamic range log10(|rigid| / |free|)."""
-        return np.log10(np.abs(self.rigid_impedance) / np.abs(self.free_impedance))
+        return np.log10(np.abs(self.rigid) / np.abs(self.free))
 
 
 def transmitted_z_width(H: Complex) -> ZWidth:
