@@ -6,7 +6,7 @@ H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
-
-if TYPE_CHECKING:
-    pass
 
 RealArray = NDArray[np.float64]
 BooleanArray = NDArray[np.bool_]

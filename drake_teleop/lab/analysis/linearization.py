@@ -122,9 +122,9 @@ class Linearization:
 
         Above 800 states they are only those near the unit circle, up to 100 Hz.
         """
-        size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
-        if size <= _MAX_DENSE_STATES:
-            values = np.linalg.eigvals(self.with_delays_as_states().A)
+        A = self._state_matrix_with_delays()
+        if (size := A.shape[0]) <= _MAX_DENSE_STATES:
+            values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
             raise DrakeTeleopError(
                 f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
@@ -133,15 +133,16 @@ class Linearization:
             )
         else:
             values = _find_eigenvalues_near_circle(
-                self._sparse_state_matrix(size), 2 * np.pi * _MAX_EIGENVALUE_FREQUENCY_HZ * self.dt
+                A.astype(complex).tocsc(), 2 * np.pi * _MAX_EIGENVALUE_FREQUENCY_HZ * self.dt
             )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
-    def _sparse_state_matrix(self, size: int) -> Any:
+    def _state_matrix_with_delays(self) -> Any:
         from scipy.sparse import lil_array
 
         n = end = len(self.A)
-        A = lil_array((size, size), dtype=complex)
+        size = n + sum(len(rows) * periods for rows, _, periods in self.loops)
+        A = lil_array((size, size))
         A[:n, :n] = self.A
         for rows, columns, periods in self.loops:
             start, width = end, len(rows)
@@ -150,14 +151,20 @@ class Linearization:
             A[:n, end - width : end] = self.B[:, columns]
             for k in range(start + width, end):
                 A[k, k - width] = 1.0
-        return A.tocsc()
+        return A
 
     def with_delays_as_states(self) -> Linearization:
         """Return the model with each delay as a shift register among the states."""
-        result = dataclasses.replace(self, loops=())
-        for rows, columns, periods in self.loops:
-            result = _add_shift_register(result, rows, columns, periods)
-        return result
+        A = self._state_matrix_with_delays().toarray()
+        delays = len(A) - len(self.A)
+        names = [
+            f"delayed {self.outputs[row]} {k + 1}"
+            for rows, _, periods in self.loops
+            for k in range(periods)
+            for row in rows
+        ]
+        B, C = np.pad(self.B, ((0, delays), (0, 0))), np.pad(self.C, ((0, 0), (0, delays)))
+        return dataclasses.replace(self, A=A, B=B, C=C, states=(*self.states, *names), loops=())
 
     def to_control(self) -> Any:
         """Return a discrete `control.StateSpace`; the name "port.x" becomes "port[x]"."""
@@ -203,21 +210,6 @@ def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
         found = np.concatenate([found, values[~known]])
         angle = max(float(np.angle(values).max()), angle + 1e-4)
     return found
-
-
-def _add_shift_register(
-    system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
-) -> Linearization:
-    n, width = len(system.A), len(rows)
-    size = n + width * periods
-    A, B = np.zeros((size, size)), np.zeros((size, len(system.inputs)))
-    C = np.zeros((len(system.outputs), size))
-    A[:n, :n], B[:n], C[:, :n] = system.A, system.B, system.C
-    A[n : n + width, :n] = system.C[list(rows)]
-    A[n + width :, n : size - width] = np.eye(size - n - width)
-    A[:n, size - width :] = system.B[:, columns]
-    names = [f"delayed {system.outputs[row]} {k + 1}" for k in range(periods) for row in rows]
-    return dataclasses.replace(system, A=A, B=B, C=C, states=(*system.states, *names))
 
 
 def linearize(
@@ -411,7 +403,7 @@ class _PeriodSimulator:
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
         remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
-        return [
+        groups = [
             whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
             whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
             whole_group("master_device", 2, np.full(6, _RATE_STEP)),
@@ -422,13 +414,11 @@ class _PeriodSimulator:
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
             _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
-            *self._ik_state_groups(),
         ]
-
-    def _ik_state_groups(self) -> list[_StateGroup]:
-        steps = np.full(self._joints, self._command_step)
-        command = _StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps)
-        return [command] if self._has_ik_state else []
+        if self._has_ik_state:
+            steps = np.full(self._joints, self._command_step)
+            groups.append(_StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps))
+        return groups
 
     def get_state(self) -> Array:
         parts = []
@@ -462,9 +452,6 @@ class _PeriodSimulator:
         self._fix_input("slave_plant", "applied_spatial_force", [self._push])
         self._fix_input("wrist_sensor", "applied_wrench_W", push)
 
-    def _read_slave_state(self) -> Array:
-        return self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
-
     def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
         context = self._simulator.get_mutable_context()
@@ -479,10 +466,8 @@ class _PeriodSimulator:
         return self.get_state()
 
     def _evaluate_outputs(self) -> Array:
-        pose, state = (
-            self._evaluate_output("kinematic_scaling", "pose_command"),
-            self._read_slave_state(),
-        )
+        pose = self._evaluate_output("kinematic_scaling", "pose_command")
+        state = self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
         J = np.empty((6, self._joints))
         jacobian(self._arm, state[: self._joints], J)
         return np.concatenate(
