@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import UpdateProgress, show_progress
-from drake_teleop.lab.studies.design import Factor, FactorValue, Study
+from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
     GIVEN_SETTINGS_NAME,
@@ -70,12 +70,12 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_lists([GIVEN_SETTINGS_NAME], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        _study_of_settings(Settings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
         trial,
     )
     quiet = execute(
         "noise",
-        _study_of_lists(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES),
+        _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]),
         trial,
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
@@ -113,7 +113,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         )
     _, chosen, inside = found[0]
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
-    limits = execute("limits", _study_of_settings(dataclasses.asdict(chosen), ends, walls), trial)
+    limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
     return SearchResult(chosen, search, given, inside, limits)
 
 
@@ -137,7 +137,7 @@ def _find_gamma_limit_in_station(
 
     def run_at_gamma(gamma: float) -> list[Row]:
         nonlocal tries
-        tried = dataclasses.asdict(settings) | {"gamma": margin * gamma}
+        tried = dataclasses.replace(settings, gamma=margin * gamma)
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
         for wall in dict.fromkeys(trial.stated_set.walls[::-1]):
@@ -209,33 +209,13 @@ def _rms_load_force(trial: StationTrial) -> float:
     return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of_settings(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
-    gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
-    return _study_of_lists(
-        [settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES
-    )
-
-
-def _study_of_lists(
-    methods: list[str],
-    gamma: float,
-    sigma: float,
-    low_pass: float,
-    hands: list[str],
-    walls: list[float],
-    measures: list[str],
-) -> Study:
-    values: dict[str, list[FactorValue]] = {
-        "method": [*methods],
-        "gamma": [gamma],
-        "sigma_inertia": [sigma],
-        "low_pass_hz": [low_pass],
-        "hand": [*hands],
-        "wall": [*walls],
-    }
+def _study_of_settings(settings: Settings, hands: list[str], walls: list[float]) -> Study:
     factors = [
-        Factor(field=name, words=listed) if isinstance(listed[0], str)  # type: ignore[arg-type]
-        else Factor(field=name, values=listed)  # type: ignore[arg-type]
-        for name, listed in values.items()
-    ]  # fmt: skip
-    return Study(factors=factors, measures=measures)
+        Factor(field="method", words=[settings.method]),
+        Factor(field="gamma", values=[settings.gamma]),
+        Factor(field="sigma_inertia", values=[settings.sigma_inertia]),
+        Factor(field="low_pass_hz", values=[settings.low_pass_hz]),
+        Factor(field="hand", words=hands),
+        Factor(field="wall", values=walls),
+    ]
+    return Study(factors=factors, measures=TRIAL_MEASURES)
