@@ -163,13 +163,6 @@ class _PeriodMapRows:
             row[..., index] += value
         return row
 
-    def _environment_entries(self) -> dict[int, Any]:
-        return {
-            SLAVE_POSITION_INDEX: self._axis.wall_stiffness,
-            SLAVE_VELOCITY_INDEX: self._axis.wall_damping,
-            _ENVIRONMENT_FORCE_INDEX: 1.0,
-        }
-
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
@@ -197,13 +190,14 @@ class _PeriodMapRows:
     def sensor_rows(self, sections: Array) -> Array:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
-        environment = axis.gamma - felt_mass / axis.slave_mass
-        value = self._make_row(
-            {
-                index: axis.force_scale * environment * share
-                for index, share in self._environment_entries().items()
-            }
-        ) + self._make_row({SERVO_ACCELERATION_INDEX: axis.force_scale * felt_mass})
+        scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
+        contact_force = {
+            SLAVE_POSITION_INDEX: scale * axis.wall_stiffness,
+            SLAVE_VELOCITY_INDEX: scale * axis.wall_damping,
+            _ENVIRONMENT_FORCE_INDEX: scale,
+        }
+        load_force = {SERVO_ACCELERATION_INDEX: axis.force_scale * felt_mass}
+        value = self._make_row(contact_force) + self._make_row(load_force)
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
