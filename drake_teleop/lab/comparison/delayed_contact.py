@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import copy_into, quaternion_of_matrix
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
@@ -19,7 +17,7 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, 
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
-from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.plant import NominalSlave
 
 _START_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
@@ -140,19 +138,8 @@ def _slave_heights_and_rotations(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     arm = slave_arm(scenario)
-    q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
-    poses = _sensor_poses(arm.table, q)
+    poses = np.empty((len(result.t), 7))
+    for pose, state in zip(poses, result["slave_state"], strict=True):
+        pose_into(arm.table, np.ascontiguousarray(state[: arm.num_joints]), pose)
     rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
-
-
-@njit(cache=True)
-def _sensor_poses(arm, q):
-    R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
-    for k in range(q.shape[0]):
-        forward_kinematics(arm, q[k], R, p)
-        orientation = quaternion_of_matrix(R)
-        for i in range(4):
-            poses[k, i] = orientation[i]
-        copy_into(poses[k], 4, p, 0, 3)
-    return poses
