@@ -184,7 +184,9 @@ def simulate_press(
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
-    return row | _replace_nonfinite(dataclasses.asdict(found) | additional) | {"error": None}, shown
+    for name, value in (dataclasses.asdict(found) | additional).items():
+        row[name] = None if isinstance(value, float) and not np.isfinite(value) else value
+    return row | {"error": None}, shown
 
 
 def _run_while_stable(
@@ -317,10 +319,3 @@ def _run_parallel(
         results.append(result)
         progress(len(results) / len(cases))
     return results
-
-
-def _replace_nonfinite(figures: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: None if isinstance(value, float) and not np.isfinite(value) else value
-        for name, value in figures.items()
-    }
