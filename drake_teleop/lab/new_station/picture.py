@@ -29,12 +29,12 @@ _WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _TRIAD_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
 _SPIRAL_INDICES = np.arange(0.5, 250.0)
+_SPIRAL_RADII = np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
+_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES
 _HULL_SAMPLE_DIRECTIONS = np.column_stack(
     [
-        np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
-        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES),
-        np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
-        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES),
+        _SPIRAL_RADII * np.cos(_SPIRAL_ANGLES_RAD),
+        _SPIRAL_RADII * np.sin(_SPIRAL_ANGLES_RAD),
         1.0 - _SPIRAL_INDICES / 125.0,
     ]
 )
@@ -47,7 +47,8 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
-    chain = _joint_chain_points(plan)
+    at_start = postures_at(shapes.arm, plan.place.q[np.newaxis])
+    chain = np.vstack([at_start.origins[0], at_start.p_WS])
     points = np.vstack([surfaces.reshape(-1, 3), chain])
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
@@ -115,14 +116,9 @@ def _hull_triangles(points: Array) -> Array:
 def _box_triangles(top: Array, size: Array) -> Array:
     # Small triangles are better sorted by depth than large ones.
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
-        _WALL_DIVISIONS,
-        _WALL_DIVISIONS,
-        2,
-    ]
-    pieces = [
-        _hull_triangles(cell + corners / [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]) for cell in cells
-    ]
+    counts = [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]
+    cells = np.array(list(product(*map(range, counts)))) / counts
+    pieces = [_hull_triangles(cell + corners / counts) for cell in cells]
     unit = np.concatenate(pieces)
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
     triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
@@ -143,11 +139,6 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     lines = [[(a, y[0], height), (a, y[-1], height)] for a in x]
     lines += [[(x[0], b, height), (x[-1], b, height)] for b in y]
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
-
-
-def _joint_chain_points(plan: StationPlan) -> Array:
-    at_start = postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis])
-    return np.vstack([at_start.origins[0], at_start.p_WS])
 
 
 def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:

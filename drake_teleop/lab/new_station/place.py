@@ -188,10 +188,7 @@ def find_start_place(
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )
-    pose = np.empty(7)
-    pose_into(arm.table, best.q, pose)
-    if axis == "z":
-        pose = best.pose
+    pose = best.pose if axis == "z" else _sensor_pose_at(arm, best.q)
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
@@ -347,7 +344,6 @@ def _place_merit(place: StartPlace) -> tuple[float, float, bool, float]:
 def _with_reachable_cube(
     arm: ArmModel, place: StartPlace, is_free: bool, vertical: bool
 ) -> StartPlace:
-    moves = _reaches_by_ik if is_free else _reaches_by_position
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
@@ -355,21 +351,18 @@ def _with_reachable_cube(
         signs = signs[[2, 5]]
     largest = 0.0
     for half in _CUBE_HALVES_M:
-        if not all(moves(arm, place, half * each) for each in signs):
+        if not all(_can_reach(arm, place, half * each, is_free) for each in signs):
             break
         largest = half
     room = place.joint_margin if largest else 0.0
     return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
-def _reaches_by_ik(arm: ArmModel, place: StartPlace, displacement: Array) -> bool:
-    q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
-    return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_DISPLACEMENT)
-
-
-def _reaches_by_position(arm: ArmModel, place: StartPlace, displacement: Array) -> bool:
+def _can_reach(arm: ArmModel, place: StartPlace, displacement: Array, is_free: bool) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
-    q, _ = find_posture(arm, target, place.q)
+    q, status = find_posture(arm, target, place.q)
+    if is_free:
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_DISPLACEMENT)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_POSITION_ERROR_RATIO * np.linalg.norm(displacement))
 

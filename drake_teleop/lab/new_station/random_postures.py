@@ -184,9 +184,9 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     """
     margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
-    sigma = np.minimum(
-        smallest_singular_values(arm, postures) / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0
-    )
+    # Only as many singular values as the arm has degrees of freedom.
+    smallest = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
     elbow = (
         np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
         / _SUFFICIENT_ELBOW_UP_SHARE
@@ -222,12 +222,6 @@ def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _singular_values(arm, few)
     return int((values > _ROUNDING_TOLERANCE * values[:, :1]).sum(axis=1).max())
-
-
-def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
-    """Return the smallest singular value (k,) of the Jacobian among its degrees of freedom [m]."""
-    smallest: Array = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
-    return smallest
 
 
 def elbow_up_share(postures: Postures, reach: float) -> Array:
