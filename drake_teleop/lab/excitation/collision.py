@@ -159,15 +159,11 @@ class CollisionScene:
         finalize_plant(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
-        self._rows = self._find_link_row_of_bodies()
-
-    def _find_link_row_of_bodies(self) -> dict[BodyIndex, int]:
-        rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
+        self._rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
             for body in self.plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
-                rows[body] = row
-        return rows
+                self._rows[body] = row
 
     def find_collision_candidates(
         self, postures: Array, start: Array | None
@@ -212,17 +208,14 @@ class CollisionScene:
             neighbours = constant or np.mean(of_pair < MIN_CLEARANCE_M) >= _NEIGHBOUR_SHARE
             touch = start is not None and of_all[-1] < MIN_CLEARANCE_M
             if touch and not neighbours:
-                touching.append(" and ".join(self._body_names(a, b)))
+                frames = map(self.scene_graph.model_inspector().GetFrameId, (a, b))
+                names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+                touching.append(" and ".join(names))
             if touch or neighbours:
                 exclude = CollisionFilterDeclaration().ExcludeBetween
                 manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
                 del distances[a, b]
         return distances, sorted(set(touching))
-
-    def _body_names(self, *shapes: GeometryId) -> list[str]:
-        inspector = self.scene_graph.model_inspector()
-        frames = map(inspector.GetFrameId, shapes)
-        return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
     def bounding_capsules(
         self, candidates: dict[_ShapePair, Array], postures: Array
