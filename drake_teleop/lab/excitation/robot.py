@@ -15,7 +15,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import MIN_CLEARANCE_M, CollisionScene, ParseArm
+from drake_teleop.lab.excitation.collision import MIN_CLEARANCE_M, CollisionScene
 from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
@@ -131,7 +131,10 @@ def RobotFromModel(
 
     assumptions = ["a table at z = 0"]
     with translate_drake_errors(path):
-        arm = _read_arm(parse)
+        plant = MultibodyPlant(0.0)
+        instance, frame = parse(plant)
+        finalize_plant(plant)
+        arm = ArmModelFromPlant(plant, instance, frame.name())
     check_size(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
@@ -232,13 +235,6 @@ def _make_robot(
         assumptions=tuple(assumptions),
         temporary_folders=tuple(folders),
     )
-
-
-def _read_arm(parse: ParseArm) -> ArmModel:
-    plant = MultibodyPlant(0.0)
-    instance, frame = parse(plant)
-    finalize_plant(plant)
-    return ArmModelFromPlant(plant, instance, frame.name())
 
 
 def _phi_of_compact_load(mass: float) -> Array:
