@@ -70,19 +70,17 @@ def check_motion(
 ) -> list[LimitUse]:
     """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
     names, limits = robot.arm.joint_names, robot.limits
-    motion = _evaluate_motion(robot, q, qd, qdd, progress)
+    torque, sensor, workspace, clearance, nearest = _evaluate_motion(robot, q, qd, qdd, progress)
     uses = [
         _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
         _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
         _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _largest_use("torque", np.abs(motion.joint_torques) / limits.max_torques, t, names),
-        _largest_use(
-            "sensor", motion.sensor_norms / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES
-        ),
-        _largest_use("workspace", motion.workspace_uses, t, ("x", "y", "z") * len(limits.points_S)),
-        _largest_use("clearance", motion.clearance_uses[:, np.newaxis], t, ("",)),
+        _largest_use("torque", np.abs(torque) / limits.max_torques, t, names),
+        _largest_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
+        _largest_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_use("clearance", clearance[:, np.newaxis], t, ("",)),
     ]
-    uses[-1] = replace(uses[-1], where=motion.nearest_shapes[int(np.argmax(motion.clearance_uses))])
+    uses[-1] = replace(uses[-1], where=nearest[int(np.argmax(clearance))])
     without_end = {"position": limits.q_half, "workspace": limits.box_half}
     missing = [name for name, half in without_end.items() if np.isinf(half).all()]
     return sorted(
@@ -95,18 +93,10 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
     return LimitUse(limit, float(shares[when, which]), float(t[when]), names[which])
 
 
-@dataclass(frozen=True)
-class _MotionLimitSignals:
-    joint_torques: Array
-    sensor_norms: Array
-    workspace_uses: Array
-    clearance_uses: Array  #: required over actual distance
-    nearest_shapes: list[str]
-
-
 def _evaluate_motion(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
-) -> _MotionLimitSignals:
+) -> tuple[Array, Array, Array, Array, list[str]]:
+    # Joint torques, sensor norms, uses of workspace and clearance, nearest shapes.
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
@@ -146,7 +136,7 @@ def _evaluate_motion(
             progress(k / len(q))
     progress(1.0)
     sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
-    return _MotionLimitSignals(torque, sensor, workspace, clearance, nearest)
+    return torque, sensor, workspace, clearance, nearest
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
