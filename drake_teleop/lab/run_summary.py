@@ -52,20 +52,14 @@ def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
     return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_TAIL_S
 
 
-def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] in S with the final load estimate."""
-    estimate = result["load_estimate"][-1]
-    check_identified("load_estimate", estimate[6:])
-    wrench, s, omega, alpha = sensor_samples(result)
-    return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
-
-
 def summarise(run: ScenarioRun) -> dict[str, Any]:
     """Return the content of summary.json without the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
-    measured = result["measured_wrench_S"] - estimate[:6]
-    calculated = calculated_contact_wrench(result)
+    check_identified("load_estimate", estimate[6:])
+    wrench, *motion = sensor_samples(result)
+    measured = wrench - estimate[:6]
+    calculated = contact_wrench(wrench, estimate[:6], *motion, estimate[6:])
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
     free = _since_contact_s(contact, result.t) > FILTER_TAIL_S
