@@ -62,6 +62,8 @@ def run_study(
     `basis` is JSON data of all inputs of the rows besides the study. `shard` "K/N" restricts runs
     and rows to this shard; `merge` collects the rows of all shards and runs nothing.
     """
+    import polars as pl
+
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":
         raise DrakeTeleopError(
@@ -98,7 +100,8 @@ def run_study(
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
                     for found in workers.run_chunks(run, left):
-                        _store_rows(store, found, schema)
+                        columns = {name: [row.get(name) for row in found] for name in schema}
+                        store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
                     new = study.next_points(points, _objective_of_points(study, store, len(points)))
                     chunks = _group_into_chunks(study.rows(new, len(points)))
@@ -187,13 +190,6 @@ def _run_chunk(
             # Not stored in the table, which must be reproducible.
             found.append(row | measures | {_RUN_TIME_KEY: time.monotonic() - start})
     return found
-
-
-def _store_rows(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
-    import polars as pl
-
-    columns = {name: [row.get(name) for row in rows] for name in schema}
-    store.write(pl.DataFrame(columns, schema=schema))
 
 
 def _table_schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:

@@ -151,16 +151,12 @@ def _relative_means(table: Array, weights: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
         means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
-    return means / means[:, -1, _index_of_gamma_1(), None, None]
+    return means / means[:, -1, _scale_axes()[1].index(1.0), None, None]  # sigma = gamma = 1
 
 
 def _scale_axes() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
     return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
-
-
-def _index_of_gamma_1() -> int:
-    return _scale_axes()[1].index(1.0)
 
 
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:

@@ -116,20 +116,16 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:
-        _lock_folder(handle, out)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DrakeTeleopError(
+                "is in use by another process", where=str(out), remedy="wait for it, or stop it"
+            ) from None
         write_or_check_identity(out, identity)
         yield
     finally:
         os.close(handle)
-
-
-def _lock_folder(handle: int, out: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise DrakeTeleopError(
-            "is in use by another process", where=str(out), remedy="wait for it, or stop it"
-        ) from None
 
 
 def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:

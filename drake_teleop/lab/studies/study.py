@@ -95,7 +95,8 @@ def study_command(
     study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_num_runs(str(path), yes)
-    data, where = ReadScenario(_scenario_path(study, path))
+    known = study.scenario in ScenarioNames()
+    data, where = ReadScenario(study.scenario if known else path.parent / study.scenario)
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_factor_values(factor, f"{path}:factors[{index}]")
@@ -125,11 +126,6 @@ def LoadStudy(path: str | Path) -> Study:
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
-
-
-def _scenario_path(study: Study, path: Path) -> str | Path:
-    known = study.scenario in ScenarioNames()
-    return study.scenario if known else path.parent / study.scenario
 
 
 def _check_factor_values(factor: Factor, where: str) -> None:
