@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from drake_teleop.lab.reproduction.report import (
     Comparison,
-    ReportFigure,
     compare_with_paper,
     describe_unaccepted,
     figure_captions,
@@ -48,7 +47,7 @@ def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
         path,
         setup=setup or {"Seed": "7"},
         summary=summary,
-        figures=[ReportFigure("Fig. 6", picture, figure_captions(summary)["fig6"])],
+        figures=[("Fig. 6", picture, figure_captions(summary)["fig6"])],
         parameters=parameter_rows(TRUE, TRUE + 0.01, STD),
         replay=replay,
     )

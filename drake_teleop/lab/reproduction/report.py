@@ -68,15 +68,6 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class ReportFigure:
-    """Figure of the report, with title and caption."""
-
-    title: str
-    png: Path
-    caption: str
-
-
-@dataclass(frozen=True)
 class ParameterRow:
     """Row of the identification table, in `unit`."""
 
@@ -195,29 +186,26 @@ def parameter_rows(
     return rows
 
 
-def library_versions() -> dict[str, str]:
-    names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
-    return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
-
-
 def write_report(
     path: Path,
     *,
     setup: Mapping[str, str],
     summary: Mapping[str, Any],
-    figures: Sequence[ReportFigure],
+    figures: Sequence[tuple[str, Path, str]],
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures."""
+    """Write the HTML page with embedded figures, each a title, a PNG file and a caption."""
+    names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
-        versions=library_versions(),
+        versions={"Python": platform.python_version()}
+        | {name: metadata.version(name) for name in names},
         tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, png_data_url(item.png)) for item in figures],
+        figures=[(title, png_data_url(png), caption) for title, png, caption in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,

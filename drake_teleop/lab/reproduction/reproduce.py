@@ -41,7 +41,6 @@ from drake_teleop.lab.reproduction.experiments import (
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
-    ReportFigure,
     compare_with_paper,
     figure_captions,
     parameter_rows,
@@ -72,12 +71,11 @@ def reproduce_command(
     seed = seed or 0
     make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
+        names = ("free_motion_force", "free_motion_torque", "contact_transition")
         # Each run has another seed.
         force, torque, contact = (
-            _with_log_at_hand_rate(LoadScenario(name), seed + k)
-            for k, name in enumerate(
-                ("free_motion_force", "free_motion_torque", "contact_transition"), 1
-            )
+            replace(each, rates__log_hz=each.rates.hand_hz, simulation__seed=seed + k)
+            for k, each in enumerate(map(LoadScenario, names), 1)
         )
         load = identify_load(identification_scenario(force, seed), stage)
         force_run = simulate_free_motion(
@@ -139,10 +137,6 @@ def draw_figures(
     return pictures
 
 
-def _with_log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
-    return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
-
-
 def _measure_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_time_per_simulated_second(
@@ -185,27 +179,23 @@ def _write_results(
         out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
     )
     figures = values_by_full_name(summary)
-    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
-    write_report(
-        out / "report.html",
-        setup=_describe_setup(seed, force.scenario, load),
-        summary=figures,
-        figures=_captioned_figures(out, figures),
-        parameters=parameter_rows(
-            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
-        ),
-        replay="replay.html",
-    )
-
-
-def _captioned_figures(out: Path, figures: NamedValues) -> list[ReportFigure]:
+    captions = figure_captions(figures)
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
         "fig8": "Fig. 8: contact transition",
     }
-    words = figure_captions(figures)
-    return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
+    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
+    write_report(
+        out / "report.html",
+        setup=_describe_setup(seed, force.scenario, load),
+        summary=figures,
+        figures=[(titles[name], out / f"{name}.png", captions[name]) for name in titles],
+        parameters=parameter_rows(
+            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
+        ),
+        replay="replay.html",
+    )
 
 
 def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
