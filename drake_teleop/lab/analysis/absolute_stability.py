@@ -253,9 +253,7 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_OFFSETS_IN_HALF_DIAGONALS = np.array(
-    [0.3, 1.0, 3.0, 10.0, 100.0]
-)  # offsets of the discs, in half diagonals
+_DISC_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, RealArray]:

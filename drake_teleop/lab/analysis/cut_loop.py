@@ -28,11 +28,8 @@ _POLE_ANGLE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0
 _INVERSE_GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_CROSSINGS = 32
 _MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
-_MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS, _NUM_NEWTON_STEPS = (
-    12,
-    30,
-    12,
-)  # for the growth rate, from 1/s
+_MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS = 12, 30  # from 1/s
+_NUM_NEWTON_STEPS = 12
 _UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
@@ -43,9 +40,8 @@ class CutLoop:
     open_multipliers: Complex  #: (..., n) multipliers of the cut loop
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
     period_s: Array  #: period of the hand [s], (...)
-    crossing_angles_rad: (
-        Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    )
+    #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
+    crossing_angles_rad: Array
     crossing_phases_rad: Array  #: unwrapped phases of L at these angles
     crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 

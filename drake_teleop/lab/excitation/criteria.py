@@ -25,13 +25,9 @@ CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 #: Sample rate of A16 and D16 [Hz].
 CRITERION_SAMPLE_RATE_HZ = 1000.0
 
-# Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
-# [N], [N m].
-_ACCEPTABLE_RELATIVE_MASS_ERROR, _ACCEPTABLE_COM_ERROR_M, _ACCEPTABLE_RELATIVE_INERTIA_ERROR = (
-    0.01,
-    1e-3,
-    0.1,
-)
+# Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
+_ACCEPTABLE_RELATIVE_MASS_ERROR, _ACCEPTABLE_RELATIVE_INERTIA_ERROR = 0.01, 0.1
+_ACCEPTABLE_COM_ERROR_M = 1e-3
 _ACCEPTABLE_OFFSET_ERRORS_N_NM = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
 _MIN_EIGENVALUE_RATIO = 1e-13

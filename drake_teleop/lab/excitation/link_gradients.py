@@ -26,15 +26,8 @@ from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, IS_PRISMATIC_COLUMN
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
-_S_START, _OMEGA_START, _ALPHA_START, _P_START, _THETA_START, _VIRTUAL_V_START, _VIRTUAL_W_START = (
-    0,
-    3,
-    6,
-    9,
-    12,
-    15,
-    18,
-)
+_S_START, _OMEGA_START, _ALPHA_START, _P_START, _THETA_START = 0, 3, 6, 9, 12
+_VIRTUAL_V_START, _VIRTUAL_W_START = 15, 18
 
 
 @njit(cache=True)

@@ -28,7 +28,7 @@ class SensorNoise(NamedTuple):
         assumed_wrench_std: (6,) deviations by which the estimator divides the wrench [N, N m].
         white_noise_densities: (12,) two-sided spectral densities of white noise [unit^2 s].
         random_walk_variances: (12,) random walks: variance per second [unit^2 / s].
-        p_SoAo_S: (3,) position p_SoAo_S of the accelerometer [m].
+        p_SoAo_S: (3,) position of the accelerometer [m].
         motion_error_filters: transfer functions (numerator, denominator) from the noise of s
             and of alpha to the estimates; None without accelerometer.
     """

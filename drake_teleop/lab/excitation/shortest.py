@@ -60,14 +60,10 @@ RELIABLE_PROBABILITY = 0.95
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
 _MAX_LOG_PERIOD_STEP = 0.15
-# Largest number of rounds; number of successful rounds without progress; required progress factor;
-# additional margin after a round that missed the tolerance.
-_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO, _FACTOR_MARGIN_AFTER_MISS = (
-    20,
-    1,
-    0.99,
-    1.005,
-)
+# Largest number of rounds; number of successful rounds without progress; required progress factor.
+_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO = 20, 1, 0.99
+# Additional margin after a round that missed the tolerance.
+_FACTOR_MARGIN_AFTER_MISS = 1.005
 # Number of rounds without any motion before the search fails.
 _MAX_ROUNDS_WITHOUT_MOTION = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.

@@ -37,12 +37,8 @@ _PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
-_STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_RADIUS_M, _STAND_IN_FREE_LENGTH_M = (
-    0.05,
-    0.1,
-    0.012,
-    0.05,
-)
+_STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_RADIUS_M = 0.05, 0.1, 0.012
+_STAND_IN_FREE_LENGTH_M = 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
 _MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave

@@ -43,15 +43,10 @@ MIN_RENDERED_SHARE = 0.9
 """Smallest accepted rendered force, as a share of the scaled contact force."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
-_PRESS_SETTLE_TIME_S, _REST_WINDOW_S = (
-    1.5,
-    0.8,
-)  # s, from the press to the judged time; length of that time
+_PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
-_MAX_PRESS_DEPTH_M, _MAX_DEVICE_FORCE_SHARE = (
-    0.02,
-    0.6,
-)  # m; share of the device's peak force that is used
+_MAX_PRESS_DEPTH_M = 0.02
+_MAX_DEVICE_FORCE_SHARE = 0.6  # share of the device's peak force that is used
 _SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
