@@ -57,9 +57,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
-    wrench, *motion = sensor_samples(result)
+    wrench, s, omega, alpha = sensor_samples(result)
     measured = wrench - estimate[:6]
-    calculated = contact_wrench(wrench, estimate[:6], *motion, estimate[6:])
+    calculated = contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
     free = _since_contact_s(contact, result.t) > FILTER_TAIL_S
