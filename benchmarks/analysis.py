@@ -41,8 +41,8 @@ from drake_teleop.lab.analysis.one_axis import (
     hand_impedance,
 )
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE_INDEX,
-    SAMPLED_FORCE_INDEX,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
     Sampling,
     delay_in_hand_periods,
     period_map_of_cut_loop,
@@ -246,10 +246,8 @@ def grows(axis: OneAxis, sampling: Sampling) -> bool:
     closed[: n + 1] = 0.0
     closed[:n, :n] = M[:n, :n]
     if registers:
-        closed[n, SAMPLED_FORCE_INDEX] = 1.0
-    closed[:n, n + registers - 1 if registers else SAMPLED_FORCE_INDEX] += M[
-        :n, RECEIVED_FORCE_INDEX
-    ]
+        closed[n, SAMPLED_FORCE] = 1.0
+    closed[:n, n + registers - 1 if registers else SAMPLED_FORCE] += M[:n, RECEIVED_FORCE]
     return bool(np.abs(np.linalg.eigvals(closed)).max() > 1)
 
 

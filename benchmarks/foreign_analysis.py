@@ -37,7 +37,7 @@ from drake_teleop.lab.analysis.analyze import (
     sampling_of_scenario,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
-from drake_teleop.lab.analysis.figures import OMEGA_RAD_S, axis_with_grip, stiffest_stable_walls
+from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, stiffest_stable_walls
 from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
@@ -104,10 +104,10 @@ def figures(scenario: Scenario) -> dict[str, Any]:
     along, sampling = task_direction(scenario, UNIT_VECTORS["z"]), sampling_of_scenario(scenario)
     free = linearize(scenario, load_estimate=estimate)
     with_hand = hybrid_along(
-        close_other_directions(free, scenario, along), OMEGA_RAD_S, along.hand, along.tool
+        close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
     )
     axis = along.axis
-    H = absorb_impedances(with_hand, hand=-1j * OMEGA_RAD_S * axis.hand_mass)
+    H = absorb_impedances(with_hand, hand=-1j * OMEGA * axis.hand_mass)
     limits = stiffest_stable_walls(H, axis, sampling)["each"]
     return {
         "joints": slave_arm(scenario).num_joints,
@@ -126,9 +126,9 @@ def figures(scenario: Scenario) -> dict[str, Any]:
 
 
 def off(with_hand: Any, axis: OneAxis, sampling: Sampling) -> dict[str, float]:
-    band = OMEGA_RAD_S <= _BAND
+    band = OMEGA <= _BAND
     heavy = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
-    sampled = sampled_two_port(heavy, sampling, OMEGA_RAD_S[band])
+    sampled = sampled_two_port(heavy, sampling, OMEGA[band])
     worst = 100 * np.abs(with_hand[band] - sampled).max(axis=0) / np.abs(sampled).max(axis=0)
     return {f"h{i + 1}{j + 1}": float(f"{worst[i, j]:.3g}") for i in range(2) for j in range(2)}
 

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from drake_teleop.lab.excitation.limits import (
-    allocate_link_motions,
+    empty_motions,
     write_link_motions,
     write_sensor_motion,
 )
@@ -68,7 +68,7 @@ def reached(
     sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
-    motions = allocate_link_motions(*joints[0].shape)
+    motions = empty_motions(*joints[0].shape)
     write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(motions), 3))
     write_sensor_motion(motions, vectors)

@@ -85,14 +85,14 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
 
     def rests(grip: str, wall: float, gamma: float, number: int) -> bool:
-        return search.rendered_share_in_one_axis(axis, settings, gamma, grip, wall, number) >= 0.9
+        return search.share_in_one_axis(axis, settings, gamma, grip, wall, number) >= 0.9
 
     low, high = np.log(stated.walls)
     inside, outside = [], []
     for k in range(draws):
         grip, wall = str(rng.choice(HANDS)), float(np.exp(rng.uniform(low, high)))
         inside.append(rests(grip, wall, settings.gamma, k))
-        beyond = stated.requirements.gamma_margin * float(rng.uniform(1.0, 1.2))
+        beyond = stated.requirements.margin * float(rng.uniform(1.0, 1.2))
         outside.append(not rests(grip, stated.walls[1], settings.gamma * beyond, k))
     row |= {"inside": float(np.mean(inside)), "outside_fails": float(np.mean(outside))}
     trial = StationTrial(base, base, stated, identified_load(base, False).estimate)

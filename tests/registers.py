@@ -6,8 +6,8 @@ import numpy as np
 
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE_INDEX,
-    SAMPLED_FORCE_INDEX,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
     Sampling,
     delay_in_hand_periods,
     period_map_of_cut_loop,
@@ -20,10 +20,10 @@ def closed_map(axis: OneAxis, sampling: Sampling) -> np.ndarray:
     n = len(M) - 3
     closed = np.zeros((n + registers, n + registers))
     closed[:n, :n] = M[:n, :n]
-    source = n + registers - 1 if registers else SAMPLED_FORCE_INDEX
-    closed[:n, source] += M[:n, RECEIVED_FORCE_INDEX]
+    source = n + registers - 1 if registers else SAMPLED_FORCE
+    closed[:n, source] += M[:n, RECEIVED_FORCE]
     for k in range(registers):
-        closed[n + k, n + k - 1 if k else SAMPLED_FORCE_INDEX] = 1.0
+        closed[n + k, n + k - 1 if k else SAMPLED_FORCE] = 1.0
     return closed
 
 

@@ -164,8 +164,8 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
             for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
         "noise": {
-            "force [N]": robot.scales.noise_std[0],
-            "torque [N m]": robot.scales.noise_std[1],
+            "force [N]": robot.scales.noise[0],
+            "torque [N m]": robot.scales.noise[1],
         },
         "heaviest_load_kg": float(robot.limits.heaviest_phi[0]),
         "assumed": list(robot.assumptions),
@@ -173,7 +173,7 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
 
 
 def _criterion_text(name: str, robot: Robot) -> str:
-    return CRITERION_TEXTS[name].format(L=robot.scales.characteristic_length_m)
+    return CRITERION_TEXTS[name].format(L=robot.scales.length)
 
 
 def trajectory_table(found: Excitation) -> pl.DataFrame:

@@ -26,14 +26,14 @@ from drake_teleop.lab.analysis.cut_loop import (
 )
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import (
-    MASTER_POSITION_INDEX,
-    MASTER_VELOCITY_INDEX,
-    RECEIVED_FORCE_INDEX,
-    SAMPLED_FORCE_INDEX,
-    SLAVE_POSITION_INDEX,
-    SLAVE_VELOCITY_INDEX,
+    MASTER_V,
+    MASTER_X,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
+    SLAVE_V,
+    SLAVE_X,
     Sampling,
-    _mass_spring_response,
+    _spring_response,
     delay_in_hand_periods,
     period_map_of_cut_loop,
     sampled_two_port,
@@ -90,18 +90,16 @@ def test_loop_agrees_with_a_simulation_with_small_steps(
     simulated = bench.simulate(axis, sampling, start, 0.1, 20)
     step = closed_map(axis, sampling)
     state = np.zeros(len(step))
-    state[
-        [MASTER_POSITION_INDEX, MASTER_VELOCITY_INDEX, SLAVE_POSITION_INDEX, SLAVE_VELOCITY_INDEX]
-    ] = start
+    state[[MASTER_X, MASTER_V, SLAVE_X, SLAVE_V]] = start
     outputs = np.empty_like(simulated)
     for row in outputs:
         row[:] = state[
             [
-                MASTER_POSITION_INDEX,
-                MASTER_VELOCITY_INDEX,
-                SLAVE_POSITION_INDEX,
-                SLAVE_VELOCITY_INDEX,
-                SAMPLED_FORCE_INDEX,
+                MASTER_X,
+                MASTER_V,
+                SLAVE_X,
+                SLAVE_V,
+                SAMPLED_FORCE,
             ]
         ]
         state = step @ state
@@ -186,15 +184,15 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, ste
     M = period_map_of_cut_loop(bare, sampling)
     n = len(M) - 3
     A = M[:n, :n].copy()
-    A[:, SAMPLED_FORCE_INDEX] += M[:n, RECEIVED_FORCE_INDEX]
+    A[:, SAMPLED_FORCE] += M[:n, RECEIVED_FORCE]
     inner = z[:, None, None] * np.eye(n) - A
     response = np.linalg.solve(inner, np.broadcast_to(M[:n, n : n + 2], (len(w), n, 2)))
     hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
     port[:, 0, 0] += device
     for force in range(2):
         v_m, v_s = (
-            response[:, MASTER_VELOCITY_INDEX, force] / hold,
-            response[:, SLAVE_VELOCITY_INDEX, force] / hold,
+            response[:, MASTER_V, force] / hold,
+            response[:, SLAVE_V, force] / hold,
         )
         F = np.array([1 - force, force])
         np.testing.assert_allclose(port[:, 0, 0] * v_m + port[:, 0, 1] * F[1], F[0], atol=1e-9)
@@ -374,7 +372,7 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(
-        _mass_spring_response(w**2, 0.0, np.array([t])),
+        _spring_response(w**2, 0.0, np.array([t])),
         ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
         strict=True,
     ):

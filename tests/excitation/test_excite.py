@@ -26,7 +26,7 @@ from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    allocate_link_motions,
+    empty_motions,
     write_link_motions,
     write_sensor_motion,
 )
@@ -180,7 +180,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     table, phi = slave.arm.table, slave.limits.heaviest_phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
-    motions = allocate_link_motions(*joints[0].shape)
+    motions = empty_motions(*joints[0].shape)
     write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(t), 3))
     write_sensor_motion(motions, vectors)

@@ -20,8 +20,8 @@ from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
-    allocate_link_motions,
     capsule_distances,
+    empty_motions,
     write_limit_uses,
     write_link_motions,
 )
@@ -90,7 +90,7 @@ def test_unknown_criterion_error_lists_the_known_ones():
 def test_predicted_deviations_are_those_of_white_noise():
     """Scatter of weighted least squares over 400 draws; A16 and D16 from the same covariance."""
     samples = motion(200, seed=2)
-    sigma = np.repeat(SCALES.noise_std, 3)
+    sigma = np.repeat(SCALES.noise, 3)
     rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
     whitened = (rows / sigma[:, None]).reshape(-1, 16)
     errors = np.linalg.pinv(whitened) @ np.random.default_rng(3).standard_normal((1200, 400))
@@ -191,7 +191,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
-    motions = allocate_link_motions(30, 6)
+    motions = empty_motions(30, 6)
     write_link_motions(arm.table, q, qd, qdd, motions)
     smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
     write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
@@ -288,6 +288,6 @@ def test_distances_of_capsules():
     )
     rows, radii = np.full(6, -1), np.full(6, 0.1)
     pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [4, 5], [3, 4], [4, 3]])
-    distances = capsule_distances(allocate_link_motions(1, 1), rows, ends, radii, pairs)[0]
+    distances = capsule_distances(empty_motions(1, 1), rows, ends, radii, pairs)[0]
     expected = [0.5, 0.3, 1, 2, 3, np.sqrt(8), np.sqrt(8)]
     np.testing.assert_allclose(distances, np.array(expected) - 0.2, atol=1e-12)

@@ -194,11 +194,11 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     means = model.means(value[known], terms)[0]
     assert value[known].min() < means.min() and means.max() < value[known].max()
     cells, _, terms = model.comparable_levels(0, 1)
-    lost = model.failed_cells[0, 1]
+    lost = model.failed[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())
     # The edge of failures crosses one cell: one of its four points succeeded.
-    x, y = (model.factors[k].level_of_points for k in (0, 1))
+    x, y = (model.factors[k].index for k in (0, 1))
     assert known[(x == 3) & (y == 1)].sum() == 1
 
 

@@ -53,9 +53,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
             for a, b, h in zip(found, truth, halves, strict=True)
         ]
         inside.append(all(near))
-        cells = [
-            table[known_there & (model.factors[2].level_of_points == k)].mean() for k in range(5)
-        ]
+        cells = [table[known_there & (model.factors[2].index == k)].mean() for k in range(5)]
         plain.append(np.ptp(cells))
         null.append(np.ptp(found[2]))
     assert np.mean(inside) >= 0.9
@@ -157,4 +155,4 @@ def test_too_few_points_give_no_effects():
 
 def test_words_without_run_are_not_levels():
     factor = Factor("a.w", words=["a", "b", "c"])
-    assert levels_of_factor_values(factor, ["c", "a", "c"]).level_names == ["a", "c"]
+    assert levels_of_factor_values(factor, ["c", "a", "c"]).names == ["a", "c"]

@@ -12,8 +12,8 @@ from shown import type_in
 from drake_teleop.common.files import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
-    CRITERIA_OF_TASK,
     CRITERIA_SETS,
+    TASK_CRITERIA,
     draw_best_scales,
     rate_scales,
 )
@@ -38,7 +38,7 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
             for name in criteria
         }
         | {"success": np.ones((5, 6, seeds))}
-        for task, criteria in CRITERIA_OF_TASK.items()
+        for task, criteria in TASK_CRITERIA.items()
     }
 
 

@@ -16,7 +16,7 @@ from drake_teleop.lab.tuning.press_trial import (
     Settings,
     StationTrial,
     press_depth,
-    rms_above_frequency,
+    rms_above,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
 from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
@@ -73,9 +73,9 @@ def test_firm_grip_presses_less_deeply_with_a_weak_device():
 def test_only_force_above_5_hz_counts_as_oscillation():
     t = np.arange(800) * 1e-3
     slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
-    assert rms_above_frequency(slow, 1e-3, 5.0) < 0.05
-    assert rms_above_frequency(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-    assert rms_above_frequency(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+    assert rms_above(slow, 1e-3, 5.0) < 0.05
+    assert rms_above(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above(np.full(800, np.nan), 1e-3, 5.0) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -127,9 +127,7 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
     assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(
-        trial().stated_set.corners
-    )
+    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(trial().stated.corners)
     assert not all(meets_requirements(row) for row in found.limit_runs)
 
 

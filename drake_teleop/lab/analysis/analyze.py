@@ -97,7 +97,7 @@ def _analyze_in_stages(
 
     progress = stage("Two-port, margins, transparency")
     with_hand = hybrid_along(
-        close_other_directions(free, linear, along), figures.OMEGA_RAD_S, along.hand, along.tool
+        close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
     )
     H = absorb_impedances(with_hand, hand=-figures.S_AT_OMEGA * axis.hand_mass)
     closed_form = hybrid_matrix(axis, figures.S_AT_OMEGA)
@@ -147,8 +147,8 @@ def _analyze_in_stages(
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop(figures.axis_with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, figures.OMEGA_RAD_S, axis.delay)
-    return summary, ReportCurves(axis, figures.OMEGA_RAD_S, H, closed_form, wall, nyquist, maps)
+        nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
+    return summary, ReportCurves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
 
 
 def describe_wall_source(scenario: Scenario, is_known: bool) -> str:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE_INDEX,
-    SAMPLED_FORCE_INDEX,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
     Array,
     Sampling,
     period_map_of_cut_loop,
@@ -25,7 +25,7 @@ from drake_teleop.lab.analysis.period_map import (
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
 _POLE_ANGLE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
-_INVERSE_GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
+_GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_CROSSINGS = 32
 _MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
 _MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS = 12, 30  # from 1/s
@@ -41,8 +41,8 @@ class CutLoop:
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
     period_s: Array  #: period of the hand [s], (...)
     #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    crossing_angles_rad: Array
-    crossing_phases_rad: Array  #: unwrapped phases of L at these angles
+    crossing_angles: Array
+    crossing_phases: Array  #: unwrapped phases of L at these angles
     crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
@@ -70,7 +70,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
     M = period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
-    closed[..., :, SAMPLED_FORCE_INDEX] += M[..., :n, n + 3 + RECEIVED_FORCE_INDEX]
+    closed[..., :, SAMPLED_FORCE] += M[..., :n, n + 3 + RECEIVED_FORCE]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
     return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))
@@ -91,36 +91,32 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < _MIN_LOOP_GAIN:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(
-        _interpolate_within_steps(np.unwrap(angle), _zero_crossing_fractions(log_gain)), 2 * np.pi
-    )
+    lag = np.mod(_interpolate_steps(np.unwrap(angle), _crossing_fractions(log_gain)), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
     factor = np.exp(
-        -_interpolate_within_steps(
-            log_gain, np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
-        )
+        -_interpolate_steps(log_gain, np.where(is_jump, np.nan, _crossing_fractions(angle)))
     )
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _zero_crossing_fractions(value: Array) -> Array:
+def _crossing_fractions(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _interpolate_within_steps(value: Array, fraction: Array) -> Array:
+def _interpolate_steps(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period_s)[..., None]
-    turns = (loop.crossing_phases_rad - D * loop.crossing_angles_rad) / (2 * np.pi)
+    turns = (loop.crossing_phases - D * loop.crossing_angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(
-        loop.crossing_angles_rad >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns)
+        loop.crossing_angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns)
     )
     outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
     return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
@@ -129,13 +125,9 @@ def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.in
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
     inside = (
-        (loop.crossing_angles_rad > 0)
-        & (loop.crossing_angles_rad < np.pi)
-        & (loop.crossing_signs != 0)
+        (loop.crossing_angles > 0) & (loop.crossing_angles < np.pi) & (loop.crossing_signs != 0)
     )
-    steps = np.mod(loop.crossing_phases_rad, 2 * np.pi) / np.where(
-        inside, loop.crossing_angles_rad, 1.0
-    )
+    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, loop.crossing_angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
@@ -151,7 +143,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
     D = 2 * delay / period
 
-    def scale_loop_to_unit_circle(growth: Array) -> CutLoop:
+    def rescaled_loop(growth: Array) -> CutLoop:
         radius = np.exp(growth * period)[..., None]
         return CutLoop.from_multipliers(
             opened / radius, closed / radius, period, radius[..., 0] ** D
@@ -160,21 +152,19 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     # Bracket the growth rate: `low` has multipliers outside its circle, `high` has none.
     high, low = np.ones(shape), -np.ones(shape)
     for _ in range(_MAX_GROWTH_RATE_DOUBLINGS):
-        some = count_unstable_multipliers(scale_loop_to_unit_circle(high), delay) > 0
-        none = count_unstable_multipliers(scale_loop_to_unit_circle(low), delay) == 0
+        some = count_unstable_multipliers(rescaled_loop(high), delay) > 0
+        none = count_unstable_multipliers(rescaled_loop(low), delay) == 0
         if not (some | none).any():
             break
         high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
     for _ in range(_NUM_GROWTH_RATE_HALVINGS):
         middle = 0.5 * (low + high)
-        some = count_unstable_multipliers(scale_loop_to_unit_circle(middle), delay) > 0
+        some = count_unstable_multipliers(rescaled_loop(middle), delay) > 0
         low, high = np.where(some, middle, low), np.where(some, high, middle)
     # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
-    crossings = np.where(
-        radius > 0, radius * np.exp(1j * scale_loop_to_unit_circle(high).crossing_angles_rad), 0
-    )
+    crossings = np.where(radius > 0, radius * np.exp(1j * rescaled_loop(high).crossing_angles), 0)
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
     found = np.zeros(z.shape, dtype=bool)
@@ -195,7 +185,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
 
 @njit(cache=True)
-def _evaluate_loop(closed, opened, angle, radius):
+def _loop_at(closed, opened, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
@@ -208,7 +198,7 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _evaluate_loop(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
+        value = _loop_at(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
@@ -223,16 +213,12 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    if (abs(_evaluate_loop(zeros, poles, middle, 1.0)) > level) == (
-                        last_size > level
-                    ):
+                    if (abs(_loop_at(zeros, poles, middle, 1.0)) > level) == (last_size > level):
                         low = middle
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _phase_nearest_to(
-                    _evaluate_loop(zeros, poles, low, 1.0), last_phase
-                )
+                found[1, n, count] = _phase_nearest_to(_loop_at(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -258,7 +244,7 @@ def _add_pole_angles(angles, poles):
 def _add_gain_extremes(angles, poles, zeros, level):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
-        values[i] = _evaluate_loop(zeros, poles, angles[i], 1.0)
+        values[i] = _loop_at(zeros, poles, angles[i], 1.0)
     size = np.abs(values)
     more = np.empty(angles.shape[0])
     count = 0
@@ -269,19 +255,19 @@ def _add_gain_extremes(angles, poles, zeros, level):
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_NUM_GOLDEN_SECTION_STEPS):
                 a, b = (
-                    high - _INVERSE_GOLDEN_RATIO * (high - low),
-                    low + _INVERSE_GOLDEN_RATIO * (high - low),
+                    high - _GOLDEN_RATIO * (high - low),
+                    low + _GOLDEN_RATIO * (high - low),
                 )
                 at_a, at_b = (
-                    _evaluate_loop(zeros, poles, a, 1.0),
-                    _evaluate_loop(zeros, poles, b, 1.0),
+                    _loop_at(zeros, poles, a, 1.0),
+                    _loop_at(zeros, poles, b, 1.0),
                 )
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:
                     low = a
             more[count] = 0.5 * (low + high)
-            values = np.append(values, _evaluate_loop(zeros, poles, more[count], 1.0))
+            values = np.append(values, _loop_at(zeros, poles, more[count], 1.0))
             count += 1
     if count == 0:
         return angles, values

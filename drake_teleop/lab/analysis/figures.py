@@ -20,7 +20,7 @@ from drake_teleop.lab.analysis.cut_loop import (
 )
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
-from drake_teleop.lab.analysis.maps import RATE_PARAMETER_NAME, StabilityMap, stability_map
+from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import TaskDirection
@@ -40,10 +40,10 @@ Array = NDArray[np.float64]
 #: N/m, walls of the table of margins, in addition to the scenario's own.
 WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
 COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
-OMEGA_RAD_S: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
-S_AT_OMEGA: Complex = 1j * OMEGA_RAD_S.astype(complex)
+OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
+S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
 _FIT_BAND_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
-_NUM_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
+_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
 _MEASUREMENT_MOTION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
@@ -86,7 +86,7 @@ def _decay_and_frequency(multiplier: complex, period: float) -> dict[str, Any]:
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     """Return the Diagram's largest relative deviations from one-axis hybrid matrices to 30 Hz."""
-    compared = OMEGA_RAD_S <= COMPARISON_BAND_RAD_S
+    compared = OMEGA <= COMPARISON_BAND_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def greatest_deviations(other: Complex) -> dict[str, float]:
@@ -95,9 +95,7 @@ def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -
 
     return {
         "closed_form": greatest_deviations(hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])),
-        "sampled": greatest_deviations(
-            sampled_two_port(with_hand_mass, sampling, OMEGA_RAD_S[compared])
-        ),
+        "sampled": greatest_deviations(sampled_two_port(with_hand_mass, sampling, OMEGA[compared])),
     }
 
 
@@ -135,7 +133,7 @@ def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
     return {
         "absolutely_stable": bool(absolute_stability.is_absolutely_stable(H).all()),
         "least_parameter": float(parameter[worst]),
-        "at_Hz": float(OMEGA_RAD_S[worst] / (2 * np.pi)),
+        "at_Hz": float(OMEGA[worst] / (2 * np.pi)),
         "lacking_damping_Ns_per_m": float(absolute_stability.required_damping(H).max()),
         "passive": bool(absolute_stability.is_passive(scaled).all()),
         "scattering_norm": float(norm.max()),
@@ -145,7 +143,7 @@ def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
 def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
     hands = absolute_stability.impedance_range_of_grips()
-    limit = float(absolute_stability.stiffness_limit(H, OMEGA_RAD_S, hands).min())
+    limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
         grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
         for grip in GRIP_IMPEDANCES
@@ -163,7 +161,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 def transparency_values(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
     """Return displayed and ideal impedances, and the tracking bandwidth; `wall`: [N/m], [N s/m]."""
-    fitted = OMEGA_RAD_S <= _FIT_BAND_RAD_S
+    fitted = OMEGA <= _FIT_BAND_RAD_S
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S_AT_OMEGA), "wall": wall[1] + wall[0] / S_AT_OMEGA}
     for name, environment in environments.items():
@@ -172,25 +170,20 @@ def transparency_values(H: Complex, axis: OneAxis, wall: tuple[float, float]) ->
         noticed = transparency.is_difference_noticed(felt, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
-            which: transparency.fit_apparent_impedance(
-                impedance[fitted], OMEGA_RAD_S[fitted]
-            )._asdict()
+            which: transparency.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
             for which, impedance in (("felt", felt), ("ideal", ideal))
         }
-        figures[name]["unnoticed_to_Hz"] = (
-            float(OMEGA_RAD_S[first - 1] / (2 * np.pi)) if first else 0.0
-        )
+        figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
     tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
     end = len(tracks) if tracks.all() else int(np.argmin(tracks))
-    figures["tracking_bandwidth_Hz"] = float(OMEGA_RAD_S[max(end - 1, 0)] / (2 * np.pi))
+    figures["tracking_bandwidth_Hz"] = float(OMEGA[max(end - 1, 0)] / (2 * np.pi))
     width = transparency.transmitted_z_width(H).decades
     figures["width_decades"] = {
-        f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA_RAD_S, width))
-        for hz in (1.0, 5.0, 10.0)
+        f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA, width)) for hz in (1.0, 5.0, 10.0)
     }
-    change = transparency.smallest_stiffness_change(H, OMEGA_RAD_S, wall[0])
+    change = transparency.smallest_stiffness_change(H, OMEGA, wall[0])
     figures["smallest_stiffness_N_per_m"] = {
-        "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA_RAD_S, change)),
+        "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, change)),
         "on the wall itself": transparency.WEBER_FRACTION * wall[0],
     }
     return figures
@@ -253,7 +246,7 @@ def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: StartStage
 ) -> dict[str, dict[str, StabilityMap]]:
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
-    n, tool = _NUM_POINTS_PER_MAP_AXIS, axis.tool_mass
+    n, tool = _POINTS_PER_MAP_AXIS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
     walls = np.geomspace(100.0, 1e5, n)
     # The sensor's low-pass has to stay below half of its rate.
@@ -268,7 +261,7 @@ def parameter_maps(
         ),
         "Rate and stiffness of the wall": (
             touching,
-            RATE_PARAMETER_NAME,
+            RATE_NAME,
             rate,
             "wall_stiffness",
             walls,

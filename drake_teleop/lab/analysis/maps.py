@@ -28,9 +28,9 @@ from drake_teleop.lab.analysis.transparency import ideal_impedance
 Array = NDArray[np.float64]
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
-RATE_PARAMETER_NAME = "rate"
+RATE_NAME = "rate"
 _PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {
-    RATE_PARAMETER_NAME,
+    RATE_NAME,
     "low_pass_hz",
 }
 _NUM_BISECTION_STEPS = 10
@@ -131,7 +131,7 @@ def _axis_and_loop_with_values(
     axis: OneAxis, sampling: Sampling, values: dict[str, Any]
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():
-        if name == RATE_PARAMETER_NAME:
+        if name == RATE_NAME:
             factor = value / sampling.hand_hz
             sampling = replace(
                 sampling,

@@ -22,16 +22,16 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 (
-    MASTER_POSITION_INDEX,
-    MASTER_VELOCITY_INDEX,
-    SERVO_ACCELERATION_INDEX,
-    SLAVE_POSITION_INDEX,
-    SLAVE_VELOCITY_INDEX,
-    SAMPLED_FORCE_INDEX,
-    FIRST_FILTER_INDEX,
+    MASTER_X,
+    MASTER_V,
+    SERVO_A,
+    SLAVE_X,
+    SLAVE_V,
+    SAMPLED_FORCE,
+    FIRST_FILTER,
 ) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
-_HAND_FORCE_INDEX, _ENVIRONMENT_FORCE_INDEX, RECEIVED_FORCE_INDEX = -3, -2, -1
+_HAND_FORCE, _ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
 _MAX_RATE_RATIO = 1000
 
 
@@ -67,7 +67,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
-    n = FIRST_FILTER_INDEX + 2 * sections.shape[-2]
+    n = FIRST_FILTER + 2 * sections.shape[-2]
     rows = _PeriodMapRows(axis, n + 3)
     hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
@@ -80,13 +80,13 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
         if time == 0:
-            new[..., [MASTER_POSITION_INDEX, MASTER_VELOCITY_INDEX], :] = hand @ M
+            new[..., [MASTER_X, MASTER_V], :] = hand @ M
         if (time * servo_samples).denominator == 1:
-            new[..., [SERVO_ACCELERATION_INDEX], :] = servo @ M
+            new[..., [SERVO_A], :] = servo @ M
         if (time * sensor_samples).denominator == 1:
-            new[..., SAMPLED_FORCE_INDEX:n, :] = sensor @ M
+            new[..., SAMPLED_FORCE:n, :] = sensor @ M
         M = new
-        M[..., [SLAVE_POSITION_INDEX, SLAVE_VELOCITY_INDEX], :] = flows[gap] @ M
+        M[..., [SLAVE_X, SLAVE_V], :] = flows[gap] @ M
     return M
 
 
@@ -109,7 +109,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     z = np.exp(1j * w * period)
     delay_factor = z ** -delay_in_hand_periods(axis, sampling)
     # Responses without delay to a force on the device, and to one of the environment.
-    C = np.eye(n)[[MASTER_VELOCITY_INDEX, SLAVE_VELOCITY_INDEX, SAMPLED_FORCE_INDEX]]
+    C = np.eye(n)[[MASTER_V, SLAVE_V, SAMPLED_FORCE]]
     response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
     (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
     hold = -np.expm1(-1j * w * period) / (1j * w * period)
@@ -166,42 +166,38 @@ class _PeriodMapRows:
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
-        x, v, push = _mass_spring_response(0.0, axis.device_damping / mass, period)
+        x, v, push = _spring_response(0.0, axis.device_damping / mass, period)
         hand_force = {
-            MASTER_POSITION_INDEX: -axis.hand_stiffness / mass,
-            MASTER_VELOCITY_INDEX: -axis.hand_damping / mass,
-            _HAND_FORCE_INDEX: 1 / mass,
+            MASTER_X: -axis.hand_stiffness / mass,
+            MASTER_V: -axis.hand_damping / mass,
+            _HAND_FORCE: 1 / mass,
         }
-        force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE_INDEX: -1 / mass})
+        force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
-            ahead[i] = ahead[i] + self._make_row(
-                {MASTER_POSITION_INDEX: x[..., i], MASTER_VELOCITY_INDEX: v[..., i]}
-            )
+            ahead[i] = ahead[i] + self._make_row({MASTER_X: x[..., i], MASTER_V: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
     def servo_rows(self) -> Array:
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
-        row = self._make_row({MASTER_POSITION_INDEX: kv * kp * self._axis.position_scale})
-        return (row + self._make_row({SLAVE_POSITION_INDEX: -kv * kp, SLAVE_VELOCITY_INDEX: -kv}))[
-            ..., None, :
-        ]
+        row = self._make_row({MASTER_X: kv * kp * self._axis.position_scale})
+        return (row + self._make_row({SLAVE_X: -kv * kp, SLAVE_V: -kv}))[..., None, :]
 
     def sensor_rows(self, sections: Array) -> Array:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
         contact_force = {
-            SLAVE_POSITION_INDEX: scale * axis.wall_stiffness,
-            SLAVE_VELOCITY_INDEX: scale * axis.wall_damping,
-            _ENVIRONMENT_FORCE_INDEX: scale,
+            SLAVE_X: scale * axis.wall_stiffness,
+            SLAVE_V: scale * axis.wall_damping,
+            _ENVIRONMENT_FORCE: scale,
         }
-        load_force = {SERVO_ACCELERATION_INDEX: axis.force_scale * felt_mass}
+        load_force = {SERVO_A: axis.force_scale * felt_mass}
         value = self._make_row(contact_force) + self._make_row(load_force)
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
-            first, second = FIRST_FILTER_INDEX + 2 * k, FIRST_FILTER_INDEX + 2 * k + 1
+            first, second = FIRST_FILTER + 2 * k, FIRST_FILTER + 2 * k + 1
             filtered = b0 * value + self._make_row({first: 1.0})
             memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
             memory.append(b2 * value - a2 * filtered)
@@ -211,26 +207,24 @@ class _PeriodMapRows:
     def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
-        x, v, push = _mass_spring_response(
-            axis.wall_stiffness / mass, axis.wall_damping / mass, time
-        )
+        x, v, push = _spring_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
         rows = []
         for i in range(2):
             p = push[..., i]
             rows.append(
                 self._make_row(
                     {
-                        SLAVE_POSITION_INDEX: x[..., i],
-                        SLAVE_VELOCITY_INDEX: v[..., i],
-                        SERVO_ACCELERATION_INDEX: p,
-                        _ENVIRONMENT_FORCE_INDEX: -p / mass,
+                        SLAVE_X: x[..., i],
+                        SLAVE_V: v[..., i],
+                        SERVO_A: p,
+                        _ENVIRONMENT_FORCE: -p / mass,
                     }
                 )
             )
         return np.stack(rows, axis=-2)
 
 
-def _mass_spring_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
+def _spring_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
     # (x, x') after `time` of x'' = u - b x' - k x, from x = 1, from x' = 1, and for u = 1.
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))

@@ -54,9 +54,9 @@ class ReportCurves:
     omega: NDArray[np.float64]  #: (n,) [rad/s]
     H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
     closed_form: Complex  #: (n, 2, 2) two-port of the one-axis model
-    wall_impedance: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
-    loop_of_grip: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
-    maps_of_grips: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
+    wall: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
+    nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
+    maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
 
 def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) -> None:
@@ -73,7 +73,7 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
         "drake_teleop.lab.analysis",
         "report.html.j2",
         s=summary,
-        wall=curves.wall_impedance[0],
+        wall=curves.wall[0],
         pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
@@ -120,7 +120,7 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
 
 def draw_bode(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
-    stiffness, damping = curves.wall_impedance
+    stiffness, damping = curves.wall
     environments = {
         "free motion": np.zeros_like(s),
         f"wall of {stiffness / 1e3:.3g} kN/m": damping + stiffness / s,
@@ -164,15 +164,13 @@ def draw_nyquist(curves: ReportCurves) -> Figure:
         near.set_xlim(-2.0, 1.0)
         near.set_ylim(-1.3, 1.3)
         for axes, adjusted in ((whole, "datalim"), (near, "box")):
-            for grip, loop in curves.loop_of_grip.items():
+            for grip, loop in curves.nyquist.items():
                 axes.plot(loop.real, loop.imag, color=_GRIP_COLOURS[grip], label=grip)
             axes.plot(-1, 0, color=BLACK, marker="+", ms=11, mew=2)
             axes.set_xlabel("real part")
             axes.set_aspect("equal", adjustable=adjusted)
         whole.set_ylabel("imaginary part")
-        whole.set_title(
-            f"Loop at the displayed force, wall of {curves.wall_impedance[0] / 1e3:.3g} kN/m"
-        )
+        whole.set_title(f"Loop at the displayed force, wall of {curves.wall[0] / 1e3:.3g} kN/m")
         near.set_title("around -1")
         whole.legend(title="grip")
     return figure
@@ -184,9 +182,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
     ratio = power_ratio(axis)
     scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
     S = scattering_matrix(scaled, reference_impedances(axis))
-    wall = absolute_stability.ImpedanceRange(
-        (0.0, 0.0), (0.0, 10.0), (0.0, curves.wall_impedance[0])
-    )
+    wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
     hands = absolute_stability.impedance_range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
     with plot_style():
@@ -196,9 +192,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
         left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         left.set_ylim(-1.2, 5.0)
         left.set_title("Llewellyn's parameter: absolutely stable from 1 on")
-        realistic = (
-            f"hands from light to firm, walls up to {curves.wall_impedance[0] / 1e3:.3g} kN/m: μ"
-        )
+        realistic = f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ"
         mu = absolute_stability.structured_singular_value(S)
         for label, value, colour in (
             ("passive: norm of S", absolute_stability.scattering_norm(S), COLOURS[2]),
@@ -252,17 +246,15 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
 def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
     """Draw the stability maps; the distortion is that of `grip`."""
     with plot_style():
-        rows = -(-len(curves.maps_of_grips) // 2)
+        rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
         cells = figure.subplots(rows, 2, squeeze=False).ravel()
-        for axes, (title, shown) in zip(cells, curves.maps_of_grips.items(), strict=False):
+        for axes, (title, shown) in zip(cells, curves.maps.items(), strict=False):
             mesh = _draw_stability_map(axes, shown, grip)
             axes.set_title(title)
-        for axes in cells[len(curves.maps_of_grips) :]:
+        for axes in cells[len(curves.maps) :]:
             axes.set_axis_off()
-        legend = (
-            cells[len(curves.maps_of_grips)] if len(cells) > len(curves.maps_of_grips) else cells[0]
-        )
+        legend = cells[len(curves.maps)] if len(cells) > len(curves.maps) else cells[0]
         for name, colour in _GRIP_COLOURS.items():
             legend.plot([], [], color=colour, label=f"limit of stability, {name} grip")
         legend.fill_between([], [], color=GREY, alpha=0.25, label=f"unstable with the {grip} grip")

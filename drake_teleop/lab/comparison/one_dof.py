@@ -276,12 +276,10 @@ def figures_of_traces(
 
     hold = window_slice(task.release_start - task.rest_window, task.release_start)
     rest = window_slice(task.end - task.rest_window, task.end)
-    hunting = max(
-        _peak_to_peak_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest)
-    )
+    hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
     turning = max(
-        (_peak_to_peak_about_parabola(x[part]) for x in angles for part in (hold, rest)),
+        (_detrended_range(x[part]) for x in angles for part in (hold, rest)),
         default=0.0,
     )
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
@@ -300,7 +298,7 @@ def figures_of_traces(
         free_force=float(
             np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
         ),
-        rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
+        rise_delay=_rise_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
 
@@ -323,16 +321,14 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float6
     return np.asarray(felt.real)
 
 
-def _peak_to_peak_about_parabola(x: NDArray[np.float64]) -> float:
+def _detrended_range(x: NDArray[np.float64]) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_delay_in_samples(
-    felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float
-) -> float:
+def _rise_samples(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))

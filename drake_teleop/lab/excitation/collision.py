@@ -39,8 +39,8 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.limits import (
-    allocate_link_motions,
     capsule_distances,
+    empty_motions,
     write_link_motions,
 )
 from drake_teleop.load.inertia import inertia_about_origin
@@ -113,7 +113,7 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 
 
 #: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
-MIN_CLEARANCE_M = 0.005
+CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
 _NEIGHBOUR_SHARE, _MIN_DISTANCE_VARIATION_M = 0.95, 1e-3
@@ -121,11 +121,11 @@ _NEIGHBOUR_SHARE, _MIN_DISTANCE_VARIATION_M = 0.95, 1e-3
 _NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
-_NEAR_CONTACT_DISTANCES_M, _CAPSULE_EXCESS_QUANTILE, _MAX_BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
+_CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
 # Smallest number of postures near contact for a correction.
-_MIN_NEAR_CONTACT_POSTURES = 5
+_MIN_NEAR_POSTURES = 5
 # Share of postures below which near capsules count although their shapes were never near.
-_RARE_NEARNESS_SHARE = 0.05
+_RARE_SHARE = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
@@ -192,21 +192,19 @@ class CollisionScene:
             q[self.arm.position_index] = posture
             self.plant.SetPositions(plant_context, q)
             query = self.scene_graph.get_query_output_port().Eval(scene_context)
-            for found in query.ComputeSignedDistancePairwiseClosestPoints(
-                _NEAR_CONTACT_DISTANCES_M[1]
-            ):
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
             if k + 1 == _NUM_COAXIALITY_POSTURES:
                 in_context = self.scene_graph.collision_filter_manager(scene_context)
-                _exclude_coaxial_pairs(in_context, distances)
+                _exclude_coaxial(in_context, distances)
         # A new manager: declarations of a manager older than the context have no effect there.
         manager = self.scene_graph.collision_filter_manager()
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
             constant = of_pair.max() < of_pair.min() + _MIN_DISTANCE_VARIATION_M
-            neighbours = constant or np.mean(of_pair < MIN_CLEARANCE_M) >= _NEIGHBOUR_SHARE
-            touch = start is not None and of_all[-1] < MIN_CLEARANCE_M
+            neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_SHARE
+            touch = start is not None and of_all[-1] < CLEARANCE_M
             if touch and not neighbours:
                 frames = map(self.scene_graph.model_inspector().GetFrameId, (a, b))
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
@@ -222,7 +220,7 @@ class CollisionScene:
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
         """Return links, ends, radii, pairs and minimum distances of capsules around the shapes."""
         inspector = self.scene_graph.model_inspector()
-        motions = allocate_link_motions(1, self.arm.num_joints)
+        motions = empty_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
@@ -250,55 +248,48 @@ class CollisionScene:
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         shapes = [capsules[shape][1] for shape in outer_shapes]
-        motions = allocate_link_motions(len(postures), self.arm.num_joints)
+        motions = empty_motions(len(postures), self.arm.num_joints)
         write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
-            near = shape_distances[a, b] < MIN_CLEARANCE_M
+            distance = _required_distance(shape_distances[a, b], capsules_apart[:, k])
+            near = shape_distances[a, b] < CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
-            if near.sum() >= _MIN_NEAR_CONTACT_POSTURES:
+            if near.sum() >= _MIN_NEAR_POSTURES:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = (
-                    near.any()
-                    or 0 < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M) < _RARE_NEARNESS_SHARE
-                )
+                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_SHARE
             if useful:
                 used.append(k)
                 distances.append(distance)
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _required_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _required_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    touching = (of_shapes > _NEAR_CONTACT_DISTANCES_M[0]) & (
-        of_shapes < _NEAR_CONTACT_DISTANCES_M[1]
-    )
+    touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (
         (of_shapes - capsules_apart)[touching]
-        if touching.sum() >= _MIN_NEAR_CONTACT_POSTURES
+        if touching.sum() >= _MIN_NEAR_POSTURES
         else np.zeros(1)
     )
-    free = capsules_apart[of_shapes > MIN_CLEARANCE_M]
+    free = capsules_apart[of_shapes > CLEARANCE_M]
     return float(
         min(
-            MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
-            np.quantile(free, _MAX_BLOCKED_SHARE),
+            CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE),
+            np.quantile(free, _BLOCKED_SHARE),
         )
     )
 
 
-def _exclude_coaxial_pairs(
-    manager: CollisionFilterManager, distances: dict[_ShapePair, Array]
-) -> None:
+def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_ShapePair, Array]) -> None:
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
-        if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_DISTANCE_VARIATION_M):
+        if first.max() < min(CLEARANCE_M, first.min() + _MIN_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))

@@ -23,12 +23,12 @@ from drake_teleop.load.regressor import regressor
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
 #: Sample rate of A16 and D16 [Hz].
-CRITERION_SAMPLE_RATE_HZ = 1000.0
+SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
-_ACCEPTABLE_RELATIVE_MASS_ERROR, _ACCEPTABLE_RELATIVE_INERTIA_ERROR = 0.01, 0.1
-_ACCEPTABLE_COM_ERROR_M = 1e-3
-_ACCEPTABLE_OFFSET_ERRORS_N_NM = (0.1, 0.005)
+_MASS_ERROR, _INERTIA_ERROR = 0.01, 0.1
+_COM_ERROR_M = 1e-3
+_OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
 _MIN_EIGENVALUE_RATIO = 1e-13
 
@@ -37,13 +37,13 @@ class CriterionScales(NamedTuple):
     """Noise, length and load that scale the criteria.
 
     Attributes:
-        noise_std: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
-        characteristic_length_m: characteristic length L [m] of kappa_w10.
+        noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
+        length: characteristic length L [m] of kappa_w10.
         phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
-    noise_std: tuple[float, float]
-    characteristic_length_m: float
+    noise: tuple[float, float]
+    length: float
     phi: Array
 
 
@@ -66,22 +66,16 @@ class Criterion:
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")
-        sigma = scales.noise_std if whitened else (1.0, 1.0)
+        sigma = scales.noise if whitened else (1.0, 1.0)
         self._rows = np.repeat(1 / np.array(sigma), 3)
         columns = np.ones(16 if self.with_offsets else 10)
         if name == "kappa_w10":
-            columns = np.array(
-                [1.0]
-                + 3 * [scales.characteristic_length_m]
-                + 6 * [scales.characteristic_length_m**2]
-            )
+            columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
             columns = _acceptable_errors(scales.phi)
         self._columns = columns
 
-    def scaled_regressor_and_information(
-        self, s: Array, omega: Array, alpha: Array
-    ) -> tuple[Array, Array]:
+    def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
         """Return the scaled regressor (6 T, c) and the information matrix (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
@@ -91,20 +85,20 @@ class Criterion:
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
         """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
-        _, gram = self.scaled_regressor_and_information(s, omega, alpha)
+        _, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(CRITERION_SAMPLE_RATE_HZ * duration))
+        return float(np.exp(log_value) / np.sqrt(SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
         """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
-        rows, gram = self.scaled_regressor_and_information(s, omega, alpha)
+        rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
@@ -127,8 +121,8 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, top_weights = _smooth_maximum_and_weights(logs, sharpness)
-        bottom, bottom_weights = _smooth_maximum_and_weights(-logs, sharpness)
+        top, top_weights = _smooth_max(logs, sharpness)
+        bottom, bottom_weights = _smooth_max(-logs, sharpness)
         return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
@@ -155,19 +149,19 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
 
 
 def _acceptable_errors(phi: Array) -> Array:
-    inertia = _ACCEPTABLE_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_ACCEPTABLE_OFFSET_ERRORS_N_NM, 3)
+    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_OFFSET_ERRORS, 3)
     return np.array(
         [
             *offsets,
-            _ACCEPTABLE_RELATIVE_MASS_ERROR * phi[0],
-            *3 * [_ACCEPTABLE_COM_ERROR_M * phi[0]],
+            _MASS_ERROR * phi[0],
+            *3 * [_COM_ERROR_M * phi[0]],
             *6 * [inertia],
         ]
     )
 
 
-def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:
+def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()

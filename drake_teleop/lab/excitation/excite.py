@@ -15,7 +15,7 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_tra
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    allocate_link_motions,
+    empty_motions,
     write_limit_uses,
     write_link_motions,
     write_sensor_motion,
@@ -167,7 +167,7 @@ def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, f
 def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
+    motions = empty_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
     write_sensor_motion(motions, out)
@@ -211,7 +211,7 @@ def _shrinking_motions_at_start(
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = allocate_link_motions(*joints[0].shape)
+    motions = empty_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMIT_NAMES)))
     gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))

@@ -388,5 +388,5 @@ def _segment_distance(first, second, nearest):
     return distance
 
 
-def allocate_link_motions(samples: int, joints: int) -> Array:
+def empty_motions(samples: int, joints: int) -> Array:
     return np.empty((samples, joints + 1, FRAME_STATE_SIZE))

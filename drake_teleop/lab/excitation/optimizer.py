@@ -17,8 +17,8 @@ from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     Limits,
-    allocate_link_motions,
     criterion_gradient,
+    empty_motions,
     finite_half_ranges,
     write_limit_uses,
     write_link_motions,
@@ -84,7 +84,7 @@ class DesignProblem:
         )
         #: (3, T, free): q, qd, qdd of unit coefficients.
         self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period_s / samples))
-        self._motions = allocate_link_motions(samples, n)
+        self._motions = empty_motions(samples, n)
         self._vectors = np.empty((3, samples, 3))
         self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
 

@@ -263,8 +263,8 @@ class _MeasureData:
         ]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
-            index = [levels.level_of_points[known] for levels in self.levels]
-            counts = [len(levels.level_names) for levels in self.levels]
+            index = [levels.index[known] for levels in self.levels]
+            counts = [len(levels.names) for levels in self.levels]
             self.model = Factorial(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
@@ -273,7 +273,7 @@ class _MeasureData:
 
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
-        count = len(levels.level_names)
+        count = len(levels.names)
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
@@ -283,35 +283,31 @@ class _MeasureData:
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
                 compared = self._count_combinations(combinations, factor)
-            why = self._missing_value_reasons(
-                is_compared & (is_compared.sum() > 1), levels.level_of_points
-            )
-        runs = np.bincount(levels.level_of_points, self.runs, count).astype(np.int64)
+            why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
+        runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
         left_out = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
-            levels.level_names, runs, mean, half, effect, effect_half, why, compared, left_out,
+            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
             self.is_fitted,
         )  # fmt: skip
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
-        if self.model is None or (
-            isinstance(self.model, LevelModel) and not self.model.product_columns
-        ):
+        if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
         a, b = self.levels[first], self.levels[second]
-        shape = len(a.level_names), len(b.level_names)
+        shape = len(a.names), len(b.names)
         is_compared, combinations, weights = self.model.comparable_levels(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
-        cell = a.level_of_points * shape[1] + b.level_of_points
+        cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
         why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
         compared = self._count_combinations(combinations, first, second)
         left_out = self._count_combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
-        names = a.level_names, b.level_names
+        names = a.names, b.names
         return PairMeans(
             fields, names, mean.reshape(shape), why, compared, left_out, self.is_fitted
         )
@@ -321,7 +317,7 @@ class _MeasureData:
         return not isinstance(self.model, Factorial)
 
     def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
-        others = (len(f.level_names) for k, f in enumerate(self.levels) if k not in shown)
+        others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(combinations) * math.prod(others))
 
     def _missing_value_reasons(self, compared: BooleanArray, cell: NDArray[np.int64]) -> list[str]:

@@ -58,27 +58,28 @@ _MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
-class FactorLevels:
+class Levels:
     """Levels of a factor at n points.
 
     Attributes:
-        level_of_points: (n,) level of each point.
-        level_names: labels of the levels with a point.
-        position_in_section: (n,) from -1/2 to 1/2 in a section of a range; None for a list.
-        regression_columns: (n, k) with zero mean: numbers, or indicators of all values but one.
-        columns_at_middles: (levels, k) these columns at the middle of each level.
+        index: (n,) level of each point.
+        names: labels of the levels with a point.
+        within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
+        centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
+            one.
+        middle_columns: (levels, k) these columns at the middle of each level.
     """
 
-    level_of_points: NDArray[np.int64]
-    level_names: list[str]
-    position_in_section: Array | None
-    regression_columns: Array
-    columns_at_middles: Array
+    index: NDArray[np.int64]
+    names: list[str]
+    within: Array | None
+    centred: Array
+    middle_columns: Array
 
 
 def levels_of_factor_values(
     factor: Factor, column: Sequence[FactorValue], parts: int = 5
-) -> FactorLevels:
+) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
@@ -89,14 +90,14 @@ def levels_of_factor_values(
         present, index = np.unique(index, return_inverse=True)
         middles = (present[:, None] + 0.5) / parts
         names = [f"{factor.low + m * (factor.high - factor.low):.3g}" for m in middles[:, 0]]
-        return FactorLevels(index, names, within, places - 0.5, middles - 0.5)
+        return Levels(index, names, within, places - 0.5, middles - 0.5)
     present, index = np.unique([listed.index(v) for v in column], return_inverse=True)
     middles = np.array([factor.coordinates(value) for value in listed])
     # The last indicator column depends on the others.
     middles = middles[:, : max(middles.shape[1] - 1, 1)]
     middles = (middles - middles.mean(axis=0))[present]
     names = [_format_value(listed[k]) for k in present]
-    return FactorLevels(index, names, None, middles[index], middles)
+    return Levels(index, names, None, middles[index], middles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,32 +105,32 @@ class LevelModel:
     """Linear regression of a measure on the levels of all factors.
 
     Attributes:
-        effect_codes: for each factor, the columns (levels, k) of its levels.
-        product_columns: columns of X for each pair (i, j) of factors.
-        failed_cells: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
-        design_matrix: (n, p) design matrix; first column: the mean.
+        codes: for each factor, the columns (levels, k) of its levels.
+        products: columns of X for each pair (i, j) of factors.
+        failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
+        X: (n, p) design matrix; first column: the mean.
         pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
-    factors: list[FactorLevels]
-    effect_codes: list[Array]
-    product_columns: dict[tuple[int, int], slice]
-    failed_cells: dict[tuple[int, int], BooleanArray]
-    design_matrix: Array
+    factors: list[Levels]
+    codes: list[Array]
+    products: dict[tuple[int, int], slice]
+    failed: dict[tuple[int, int], BooleanArray]
+    X: Array
     pseudo_inverse: Array
 
     def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `Factorial`, but with a matrix from coefficients to means."""
-        others = sorted(set(itertools.chain(*self.failed_cells)) - set(shown))
+        others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
-        shape = [len(self.factors[factor].level_names) for factor in factors]
+        shape = [len(self.factors[factor].names) for factor in factors]
         at = dict(zip(factors, np.indices(shape).reshape(len(shape), -1), strict=True))
         there = np.ones(math.prod(shape), dtype=bool)
-        for (i, j), failed in self.failed_cells.items():
+        for (i, j), failed in self.failed.items():
             there &= ~failed[at[i], at[j]]
         count = math.prod(shape[: len(shown)])
         rows, columns = largest_complete_block(there.reshape(count, -1))
-        terms = self._regression_terms(at).reshape(count, -1, self.design_matrix.shape[1])
+        terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
@@ -165,27 +166,27 @@ class LevelModel:
 
     def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))
-        terms, first = np.zeros((count, self.design_matrix.shape[1])), 1
+        terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
-        for factor, codes in enumerate(self.effect_codes):
+        for factor, codes in enumerate(self.codes):
             if factor in at:
                 terms[:, first : first + codes.shape[1]] = codes[at[factor]]
             first += codes.shape[1]
-        for (i, j), columns in self.product_columns.items():
+        for (i, j), columns in self.products.items():
             if i in at and j in at:
                 a, b = (
-                    self.factors[i].columns_at_middles[at[i]],
-                    self.factors[j].columns_at_middles[at[j]],
+                    self.factors[i].middle_columns[at[i]],
+                    self.factors[j].middle_columns[at[j]],
                 )
                 terms[:, columns] = _column_products(a, b)
         return terms
 
     @property
     def _degrees_of_freedom(self) -> int:
-        return self.design_matrix.shape[0] - self.design_matrix.shape[1]
+        return self.X.shape[0] - self.X.shape[1]
 
     def _residual_variance(self, table: Array, columns: int) -> float:
-        residuals = table - self.design_matrix @ (self.pseudo_inverse @ table)
+        residuals = table - self.X @ (self.pseudo_inverse @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
@@ -230,35 +231,28 @@ def fit_level_model(
         model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model
-            if model.design_matrix.shape[1] <= len(model.design_matrix) / 2:
+            if model.X.shape[1] <= len(model.X) / 2:
                 break
     return found
 
 
 def _build_model(
-    factors: list[FactorLevels], products: bool, known: BooleanArray, by_chance: bool
+    factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
     failed = _failed_cells(factors, known, by_chance)
-    codes = [
-        _effect_codes(len(levels.level_names), np.unique(levels.level_of_points[known]))
-        for levels in factors
-    ]
+    codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
-    columns += [code[f.level_of_points[known]] for f, code in zip(factors, codes, strict=True)]
-    columns += [
-        f.position_in_section[known, None] for f in factors if f.position_in_section is not None
-    ]
+    columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
+    columns += [f.within[known, None] for f in factors if f.within is not None]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _column_products(
-            factors[i].regression_columns[known], factors[j].regression_columns[known]
-        )
+        pair = _column_products(factors[i].centred[known], factors[j].centred[known])
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)
-    counts = sorted(len(levels.level_names) for levels in factors)
-    involved = [len(factors[k].level_names) for k in set(itertools.chain(*failed))] + counts[-2:]
+    counts = sorted(len(levels.names) for levels in factors)
+    involved = [len(factors[k].names) for k in set(itertools.chain(*failed))] + counts[-2:]
     if X.shape[1] >= points or math.prod(involved) > _MAX_COMBINATIONS:
         return None
     u, size, v = np.linalg.svd(X, full_matrices=False)
@@ -268,14 +262,14 @@ def _build_model(
 
 
 def _failed_cells(
-    factors: list[FactorLevels], known: BooleanArray, by_chance: bool
+    factors: list[Levels], known: BooleanArray, by_chance: bool
 ) -> dict[tuple[int, int], BooleanArray]:
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
-        tried, good = np.zeros((2, len(a.level_names), len(b.level_names)))
-        np.add.at(tried, (a.level_of_points, b.level_of_points), 1.0)
-        np.add.at(good, (a.level_of_points[known], b.level_of_points[known]), 1.0)
+        tried, good = np.zeros((2, len(a.names), len(b.names)))
+        np.add.at(tried, (a.index, b.index), 1.0)
+        np.add.at(good, (a.index[known], b.index[known]), 1.0)
         failed = good == 0
         if by_chance:
             share = good / np.maximum(tried, 1.0)

@@ -33,25 +33,25 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-MEASURE_OF_CRITERION = {
+CRITERIA = {
     "effort": "effort_Ns",
     "time": "task_time_s",
     "force": "contact_force_overshoot_N",
 }
 #: Selections of equally weighted criteria.
 CRITERIA_SETS = {
-    "all": tuple(MEASURE_OF_CRITERION),
-    **{name: (name,) for name in MEASURE_OF_CRITERION},
+    "all": tuple(CRITERIA),
+    **{name: (name,) for name in CRITERIA},
 }
-CRITERIA_OF_TASK = {"reach": ("effort", "time")} | dict.fromkeys(
-    ("touch", "press", "insert"), tuple(MEASURE_OF_CRITERION)
+TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
+    ("touch", "press", "insert"), tuple(CRITERIA)
 )
 """Criteria of each task; free reaching has no contact."""
 _ETA_STUDY_NAME = "scaling_object"
 _SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
     f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
 )
-_NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
+_NUM_DRAWS, _SEED = 2000, 0
 _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 
@@ -86,13 +86,13 @@ def scaling_study_command(
     """Run the missing runs of the scaling studies; write results; return answer.json's content."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in CRITERIA_OF_TASK), _ETA_STUDY_NAME):
+    for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in CRITERIA_OF_TASK}
+    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     sigmas, gammas = _scale_axes()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
@@ -117,13 +117,9 @@ def scaling_study_command(
 def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
-    counted = {
-        task: [name for name in CRITERIA_OF_TASK[task] if name in criteria] for task in tables
-    }
+    counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_BOOTSTRAP_SEED).multinomial(
-        count, np.full(count, 1 / count), _NUM_BOOTSTRAP_DRAWS
-    )
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
         np.mean([_relative_means(tables[task][name], weights) for name in names], axis=0)
@@ -163,9 +159,7 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _scale_axes()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
-    measures = {"success": "success"} | {
-        name: MEASURE_OF_CRITERION[name] for name in CRITERIA_OF_TASK[task]
-    }
+    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
         values = measure_values(rows, measure)
@@ -225,7 +219,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     levels = np.array([etas.index(value) for value in rows[_ETA_FIELD]])
     seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
-    for measure in ("success", *MEASURE_OF_CRITERION.values(), "detection_time_s"):
+    for measure in ("success", *CRITERIA.values(), "detection_time_s"):
         found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
         for index, row in enumerate(table):
             figures = (found.mean[index], found.half_width[index], found.effect_half_width[index])
@@ -237,14 +231,14 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def draw_criteria(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    tasks = [task for task in CRITERIA_OF_TASK if "force" in CRITERIA_OF_TASK[task]]
+    tasks = [task for task in TASK_CRITERIA if "force" in TASK_CRITERIA[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
             levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
-            for axes, measure in zip(line, MEASURE_OF_CRITERION.values(), strict=True):
+            for axes, measure in zip(line, CRITERIA.values(), strict=True):
                 found = estimate_means(
                     measure_values(table, measure), levels, seeds, levels.max() + 1
                 )

@@ -98,22 +98,22 @@ class StationTrial:
 
     Args:
         user_scenario: scenario of the user, with its own passivity and scales.
-        base_scenario: the same without environment, task and passivity method.
-        load_estimate: (16,) load estimate.
+        base: the same without environment, task and passivity method.
+        estimate: (16,) load estimate.
     """
 
     user_scenario: Scenario
-    base_scenario: Scenario
-    stated_set: StatedSet
-    load_estimate: Array
+    base: Scenario
+    stated: StatedSet
+    estimate: Array
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
         if values["method"] != GIVEN_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
+            scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base_scenario.channel
+        channel = self.base.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
@@ -121,10 +121,10 @@ class StationTrial:
             scenario.passivity,
             wall,
             task=task,
-            depth=press_depth(self.base_scenario, grip),
+            depth=press_depth(self.base, grip),
         )
         setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
-        station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
+        station = MakeTeleopStation(setup, load_estimate=self.estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
@@ -139,11 +139,11 @@ class StationTrial:
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
-            rms_above_frequency(felt, period, REST_BAND_HZ),
-            *(rms_above_frequency(force, period, REST_BAND_HZ) for force in free_felt),
+            rms_above(felt, period, REST_BAND_HZ),
+            *(rms_above(force, period, REST_BAND_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
-        human = self.base_scenario.operator.perception
+        human = self.base.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
             "rests": float(found.stable),
@@ -159,22 +159,19 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `max_gamma_of_low_pass`: low-pass [Hz] -> upper bound of gamma.
+    `gamma_caps`: low-pass [Hz] -> upper bound of gamma.
     """
 
-    base_scenario: Scenario
-    stated_set: StatedSet
-    max_gamma_of_low_pass: dict[float, float]
+    base: Scenario
+    stated: StatedSet
+    gamma_caps: dict[float, float]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
-        axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
+        axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = (
-            self.max_gamma_of_low_pass[settings.low_pass_hz]
-            * self.stated_set.requirements.gamma_margin
-        )
+        cap = self.gamma_caps[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -182,8 +179,7 @@ class GammaSearch:
         def stability_sign(log_gamma: float) -> float:
             gamma = float(np.exp(log_gamma))
             found = [
-                self.rendered_share_in_one_axis(axis, settings, gamma, *c, seed)
-                for c in self.stated_set.corners
+                self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
             ]
             shares[gamma] = min(found)
             return 1.0 if shares[gamma] >= MIN_RENDERED_SHARE else -1.0
@@ -202,17 +198,17 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
-        sampling = sampling_of_scenario(self.base_scenario)
+        sampling = sampling_of_scenario(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
-        for grip, wall in [*self.stated_set.corners, (self.stated_set.hands[0], 0.0)]:
+        for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
         return float(_TESTED_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
-    def rendered_share_in_one_axis(
+    def share_in_one_axis(
         self,
         axis: AxisParameters,
         settings: Settings,
@@ -222,7 +218,7 @@ class GammaSearch:
         seed: int,
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
-        forward, backward = self.base_scenario.channel.networks_of_directions()
+        forward, backward = self.base.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
         shown = {
             entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
@@ -231,15 +227,11 @@ class GammaSearch:
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = (
-            0.0
-            if self.base_scenario.wrist_sensor.ideal
-            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
-        )
+        added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
-            settings.passivity(self.stated_set),
+            settings.passivity(self.stated),
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,
@@ -247,10 +239,7 @@ class GammaSearch:
         )
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        quiet = (
-            rms_above_frequency(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ)
-            <= MAX_REST_FORCE_N
-        )
+        quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
@@ -277,7 +266,7 @@ def press_depth(base: Scenario, grip: str) -> float:
     return min(_MAX_PRESS_DEPTH_M, _MAX_DEVICE_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
-def rms_above_frequency(x: Array, period: float, frequency: float) -> float:
+def rms_above(x: Array, period: float, frequency: float) -> float:
     """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")

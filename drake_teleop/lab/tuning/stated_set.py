@@ -24,11 +24,11 @@ class TaskRequirements:
     """Requirements of a task.
 
     Args:
-        gamma_margin: factor of the loop gain that must still be stable.
+        margin: factor of the loop gain that must still be stable.
         min_low_pass_hz: lowest bandwidth of the sensor; a lower one delays the contact force.
     """
 
-    gamma_margin: float
+    margin: float
     min_low_pass_hz: float
 
 
