@@ -163,10 +163,7 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
             f"{name} [{unit}]": float(std)
             for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
-        "noise": {
-            "force [N]": robot.scales.noise[0],
-            "torque [N m]": robot.scales.noise[1],
-        },
+        "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
         "heaviest_load_kg": float(robot.limits.heaviest_phi[0]),
         "assumed": list(robot.assumptions),
     }

@@ -93,15 +93,7 @@ def test_loop_agrees_with_a_simulation_with_small_steps(
     state[[MASTER_X, MASTER_V, SLAVE_X, SLAVE_V]] = start
     outputs = np.empty_like(simulated)
     for row in outputs:
-        row[:] = state[
-            [
-                MASTER_X,
-                MASTER_V,
-                SLAVE_X,
-                SLAVE_V,
-                SAMPLED_FORCE,
-            ]
-        ]
+        row[:] = state[[MASTER_X, MASTER_V, SLAVE_X, SLAVE_V, SAMPLED_FORCE]]
         state = step @ state
     np.testing.assert_allclose(
         outputs / np.abs(simulated).max(axis=0),
@@ -190,10 +182,7 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, ste
     hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
     port[:, 0, 0] += device
     for force in range(2):
-        v_m, v_s = (
-            response[:, MASTER_V, force] / hold,
-            response[:, SLAVE_V, force] / hold,
-        )
+        v_m, v_s = (response[:, MASTER_V, force] / hold, response[:, SLAVE_V, force] / hold)
         F = np.array([1 - force, force])
         np.testing.assert_allclose(port[:, 0, 0] * v_m + port[:, 0, 1] * F[1], F[0], atol=1e-9)
         np.testing.assert_allclose(

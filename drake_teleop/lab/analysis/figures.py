@@ -259,13 +259,7 @@ def parameter_maps(
         "Error of the estimated mass and σ, in free motion": (
             *(axis, "mass_error", np.linspace(-0.9, 4.0, n) * tool, "sigma", sigma),
         ),
-        "Rate and stiffness of the wall": (
-            touching,
-            RATE_NAME,
-            rate,
-            "wall_stiffness",
-            walls,
-        ),
+        "Rate and stiffness of the wall": (touching, RATE_NAME, rate, "wall_stiffness", walls),
     }
     progress, found = stage("Maps"), {}
     for done, (title, (base, *grid)) in enumerate(parameters.items()):

@@ -29,10 +29,7 @@ Array = NDArray[np.float64]
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"
-_PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {
-    RATE_NAME,
-    "low_pass_hz",
-}
+_PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
 _NUM_BISECTION_STEPS = 10
 _DISTORTION_BAND_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # of deliberate movements
 

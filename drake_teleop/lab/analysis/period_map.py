@@ -21,15 +21,7 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
-(
-    MASTER_X,
-    MASTER_V,
-    SERVO_A,
-    SLAVE_X,
-    SLAVE_V,
-    SAMPLED_FORCE,
-    FIRST_FILTER,
-) = range(7)
+(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HAND_FORCE, _ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
 _MAX_RATE_RATIO = 1000

@@ -217,11 +217,7 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.fill_between(
-            hertz,
-            np.abs(width.free),
-            np.abs(width.rigid),
-            color=COLOURS[5],
-            alpha=0.35,
+            hertz, np.abs(width.free), np.abs(width.rigid), color=COLOURS[5], alpha=0.35
         )
         left.loglog(hertz, np.abs(width.rigid), color=COLOURS[0], label="rigid environment")
         left.loglog(hertz, np.abs(width.free), color=COLOURS[2], label="free motion")

@@ -278,10 +278,7 @@ def figures_of_traces(
     rest = window_slice(task.end - task.rest_window, task.end)
     hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max(
-        (_detrended_range(x[part]) for x in angles for part in (hold, rest)),
-        default=0.0,
-    )
+    turning = max((_detrended_range(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)

@@ -38,11 +38,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import (
-    capsule_distances,
-    empty_motions,
-    write_link_motions,
-)
+from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_plant
@@ -278,10 +274,7 @@ def _required_distance(of_shapes: Array, capsules_apart: Array) -> float:
     )
     free = capsules_apart[of_shapes > CLEARANCE_M]
     return float(
-        min(
-            CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE),
-            np.quantile(free, _BLOCKED_SHARE),
-        )
+        min(CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
     )
 
 

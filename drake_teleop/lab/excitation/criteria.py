@@ -151,14 +151,7 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
 def _acceptable_errors(phi: Array) -> Array:
     inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
     offsets = np.repeat(_OFFSET_ERRORS, 3)
-    return np.array(
-        [
-            *offsets,
-            _MASS_ERROR * phi[0],
-            *3 * [_COM_ERROR_M * phi[0]],
-            *6 * [inertia],
-        ]
-    )
+    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
 
 
 def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:

@@ -45,9 +45,7 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
 
 
 def cpu_time_per_simulated_second(
-    simulators: Mapping[str, Simulator],
-    *,
-    progress: UpdateProgress = lambda done: None,
+    simulators: Mapping[str, Simulator], *, progress: UpdateProgress = lambda done: None
 ) -> dict[str, float]:
     """Return the least CPU time per simulated second of each simulator."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}

@@ -33,16 +33,9 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-CRITERIA = {
-    "effort": "effort_Ns",
-    "time": "task_time_s",
-    "force": "contact_force_overshoot_N",
-}
+CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
-CRITERIA_SETS = {
-    "all": tuple(CRITERIA),
-    **{name: (name,) for name in CRITERIA},
-}
+CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
     ("touch", "press", "insert"), tuple(CRITERIA)
 )

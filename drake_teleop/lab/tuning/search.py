@@ -74,9 +74,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         trial,
     )
     quiet = execute(
-        "noise",
-        _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]),
-        trial,
+        "noise", _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]), trial
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -128,10 +126,7 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _find_gamma_limit_in_station(
     settings: Settings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    margin, ends = (
-        trial.stated.requirements.margin,
-        [c[0] for c in trial.stated.corners],
-    )
+    margin, ends = (trial.stated.requirements.margin, [c[0] for c in trial.stated.corners])
     hands = list(dict.fromkeys(ends))
     tries = 0
 
@@ -192,10 +187,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
 
 def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
-    human, scale = (
-        trial.base.operator.perception,
-        trial.base.force_scaling.force_scale,
-    )
+    human, scale = (trial.base.operator.perception, trial.base.force_scaling.force_scale)
     masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
