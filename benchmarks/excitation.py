@@ -97,7 +97,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
     merits = []
     for x in candidates:
         point = problem.evaluate(x, 1.0, 100.0)
-        merits.append(point.log_criterion + 10 * max(point.limit_uses.max() - 1, 0))
+        merits.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
     best, start = float("inf"), time.thread_time()
 
     def evaluate(x: np.ndarray) -> Any:
@@ -114,10 +114,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={
-                "type": "ineq",
-                "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).limit_uses,
-            },
+            constraints={"type": "ineq", "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).uses},
             options={"maxiter": 1000},
         )
     return best

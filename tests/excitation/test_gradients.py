@@ -183,7 +183,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     for k, unit in enumerate(np.eye(len(x))):
         ahead, behind = (problem.evaluate(x + sign * step * unit, 3.0, 5.0) for sign in (1, -1))
         of_criterion = ahead.log_criterion - behind.log_criterion
-        numeric = np.array([of_criterion, *(ahead.limit_uses - behind.limit_uses)]) / (2 * step)
+        numeric = np.array([of_criterion, *(ahead.uses - behind.uses)]) / (2 * step)
         np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
 
 
@@ -248,7 +248,7 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.array([next(numbers)]),
         evaluate=lambda x, *sharpness: SimpleNamespace(
-            log_criterion=0.01 * x[0], limit_uses=np.full(2, uses.get(x[0], 0.9))
+            log_criterion=0.01 * x[0], uses=np.full(2, uses.get(x[0], 0.9))
         ),
     )
     search = _DescentSearch(problem, 1, None, lambda *_: None)

@@ -53,7 +53,7 @@ def test_gradients_equal_finite_differences(slave: Robot) -> None:
     at = problem.evaluate(x, 2.0, 100.0)
     for step in (1e-6 * rng.normal(size=len(x)), np.append(np.zeros(len(x) - 1), 1e-6)):
         up, down = (problem.evaluate(x + sign * step, 2.0, 100.0) for sign in (1, -1))
-        differences = [up.log_criterion - down.log_criterion, *(up.limit_uses - down.limit_uses)]
+        differences = [up.log_criterion - down.log_criterion, *(up.uses - down.uses)]
         np.testing.assert_allclose(differences, 2 * at.gradients @ step, rtol=1e-4, atol=1e-11)
 
 
@@ -64,7 +64,7 @@ def test_tolerance_use_follows_from_white_noise_over_the_period(slave: Robot) ->
     at = problem.evaluate(x, 200.0, 100.0)
     motion = tuple(problem._vectors.copy())
     worst = problem.deviations(motion, 2.0).max()
-    assert np.exp(2 * (at.limit_uses[0] - 1)) == pytest.approx(worst, rel=0.01)
+    assert np.exp(2 * (at.uses[0] - 1)) == pytest.approx(worst, rel=0.01)
     assert problem.deviations(motion, 8.0).max() == pytest.approx(worst / 2, rel=1e-6)
 
 

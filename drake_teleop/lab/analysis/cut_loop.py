@@ -94,9 +94,8 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     lag = np.mod(_interpolate_steps(np.unwrap(angle), _crossing_fractions(log_gain)), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    factor = np.exp(
-        -_interpolate_steps(log_gain, np.where(is_jump, np.nan, _crossing_fractions(angle)))
-    )
+    fraction = np.where(is_jump, np.nan, _crossing_fractions(angle))
+    factor = np.exp(-_interpolate_steps(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
@@ -113,21 +112,19 @@ def _interpolate_steps(value: Array, fraction: Array) -> Array:
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period_s)[..., None]
-    turns = (loop.crossing_phases - D * loop.crossing_angles) / (2 * np.pi)
+    angles = loop.crossing_angles
+    turns = (loop.crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
-    around = np.where(
-        loop.crossing_angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns)
-    )
+    around = np.where(angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
     outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
     return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
-    inside = (
-        (loop.crossing_angles > 0) & (loop.crossing_angles < np.pi) & (loop.crossing_signs != 0)
-    )
-    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, loop.crossing_angles, 1.0)
+    angles = loop.crossing_angles
+    inside = (angles > 0) & (angles < np.pi) & (loop.crossing_signs != 0)
+    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 

@@ -114,9 +114,9 @@ def compare_command(
             "method": method,
             "network": network,
             "verdict": cell.verdict,
-            "felt_N": [felt for felt, _ in cell.rendered_and_contact_forces],
-            "pressed_N": [pressed for _, pressed in cell.rendered_and_contact_forces],
-            "leaked_J": cell.leaked_energy_J,
+            "felt_N": [felt for felt, _ in cell.force_pairs],
+            "pressed_N": [pressed for _, pressed in cell.force_pairs],
+            "leaked_J": cell.leaked_J,
         }
         for (method, network), cell in decision_table(summary).items()
     ]

@@ -24,27 +24,21 @@ class MethodResult:
 
     verdict: str
     #: For each leaf, means in the hold of the force on the hand and the scaled contact force [N].
-    rendered_and_contact_forces: tuple[tuple[float, float], ...] = ()
+    force_pairs: tuple[tuple[float, float], ...] = ()
     motion_texts: tuple[str, ...] = ()  #: for each leaf, motion in the hold as text; stable: empty
-    leaked_energy_J: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
+    leaked_J: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
 
     @property
     def verdict_text(self) -> str:
-        if self.verdict != VERDICT_LEAKS or self.leaked_energy_J is None:
+        if self.verdict != VERDICT_LEAKS or self.leaked_J is None:
             return self.verdict
-        number, unit = (
-            (1e3 * self.leaked_energy_J, "mJ")
-            if self.leaked_energy_J < 1.0
-            else (self.leaked_energy_J, "J")
-        )
+        number, unit = (1e3 * self.leaked_J, "mJ") if self.leaked_J < 1.0 else (self.leaked_J, "J")
         return f"leaks {_format_two_digits(number)} {unit}"
 
     @property
     def displayed_share(self) -> str:
         """Least displayed over scaled contact force of all leaf springs [%]; "" if unstable."""
-        shares = [
-            felt / pressed for felt, pressed in self.rendered_and_contact_forces if pressed > 0.0
-        ]
+        shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
@@ -71,11 +65,11 @@ def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
-        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_energy_J=leaked)
+        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
     if max(run["fast_force"] for run in runs) > MAX_HIGH_FREQUENCY_FORCE_N:
-        return MethodResult(VERDICT_CHATTERS, forces, leaked_energy_J=leaked)
+        return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
     return MethodResult(
-        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked_energy_J=leaked
+        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked_J=leaked
     )
 
 
