@@ -98,7 +98,10 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
         for number, p_BJ in enumerate(
             () if visuals else _outboard_joint_points(robot, context, body)
         ):
-            _add_link_cylinder(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
+            name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
+            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
+            along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
+            meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
 
 def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
@@ -111,13 +114,6 @@ def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> I
         p_BJ = frame.CalcPose(context, body.body_frame()).translation()
         if np.linalg.norm(p_BJ) > 1e-3:
             yield p_BJ
-
-
-def _add_link_cylinder(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
-    length = float(np.linalg.norm(p_BJ))
-    meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
-    along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
-    meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
 
 def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:

@@ -155,7 +155,9 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the total mass beyond the sensor, or remove the option",
             )
-        reserve = _phi_of_compact_load(mass - load[0])
+        missing_mass, com = mass - load[0], np.array([0.0, 0.0, _PAYLOAD_COM_M])
+        inertia = missing_mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3
+        reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
         scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
@@ -235,8 +237,3 @@ def _make_robot(
         assumptions=tuple(assumptions),
         temporary_folders=tuple(folders),
     )
-
-
-def _phi_of_compact_load(mass: float) -> Array:
-    com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
-    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

@@ -108,13 +108,10 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
         if row is not arm.table[-1] and row[IS_PRISMATIC_COLUMN]:
             p = p + angle[:, None] * R[:, :, 2]
         else:
-            R = R @ _rotations_about_z(angle)
+            c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
+            rows = c, -s, zero, s, c, zero, zero, zero, zero + 1.0
+            R = R @ np.stack(rows, 1).reshape(-1, 3, 3)  # rotation about z
     return Postures(q, np.stack(origins[:-1], 1), np.stack(axes[:-1], 1), R, p)
-
-
-def _rotations_about_z(angle: Array) -> Array:
-    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], 1).reshape(-1, 3, 3)
 
 
 def random_postures(arm: ArmModel) -> Postures:

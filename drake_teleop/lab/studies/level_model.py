@@ -174,10 +174,7 @@ class LevelModel:
             first += codes.shape[1]
         for (i, j), columns in self.products.items():
             if i in at and j in at:
-                a, b = (
-                    self.factors[i].middle_columns[at[i]],
-                    self.factors[j].middle_columns[at[j]],
-                )
+                a, b = (self.factors[k].middle_columns[at[k]] for k in (i, j))
                 terms[:, columns] = _column_products(a, b)
         return terms
 

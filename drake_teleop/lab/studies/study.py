@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
-from drake_teleop.lab.studies.design import Factor, FactorValues, Study
+from drake_teleop.lab.studies.design import FactorValues, Study
 from drake_teleop.lab.studies.effects import effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
@@ -99,7 +99,11 @@ def study_command(
     data, where = ReadScenario(study.scenario if known else path.parent / study.scenario)
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
-        _check_factor_values(factor, f"{path}:factors[{index}]")
+        ranged = factor.low is not None and factor.high is not None
+        for value in (factor.low, factor.high) if ranged else factor.level_values():
+            changed = _apply_changes({}, {factor.field: value})
+            place = f"{path}:factors[{index}]"
+            check_ranges(settings_from_data(Scenario, changed, place), place)
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
@@ -126,13 +130,6 @@ def LoadStudy(path: str | Path) -> Study:
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
-
-
-def _check_factor_values(factor: Factor, where: str) -> None:
-    ranged = factor.low is not None and factor.high is not None
-    for value in (factor.low, factor.high) if ranged else factor.level_values():
-        data = _apply_changes({}, {factor.field: value})
-        check_ranges(settings_from_data(Scenario, data, where), where)
 
 
 def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:

@@ -93,9 +93,12 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
     search = [_predict_threshold(row, trial, noises) for row in rows]
-    candidates = _best_of_each_method(search)
+    candidates: dict[str, Row] = {}  # the best of each method
+    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
+        if row["gamma"] > 0.0:
+            candidates.setdefault(row["method"], row)
     found: list[tuple[float, Settings, list[Row]]] = []
-    for row in candidates:
+    for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
         gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
@@ -113,14 +116,6 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
     limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
     return SearchResult(chosen, search, given, inside, limits)
-
-
-def _best_of_each_method(search: list[Row]) -> list[Row]:
-    best: dict[str, Row] = {}
-    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
-        if row["gamma"] > 0.0:
-            best.setdefault(row["method"], row)
-    return list(best.values())
 
 
 def _find_gamma_limit_in_station(

@@ -102,7 +102,11 @@ def tune(
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print_sentences(summary, out)
+        from rich.console import Console
+
+        console = Console()
+        for line in (*summary["sentences"], f"written to {out}; run {out / 'tuned.yaml'}"):
+            console.print(line, highlight=False, markup=False)
     return summary
 
 
@@ -198,12 +202,3 @@ def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
         axes.set_ylabel("smallest detected contact force [N]")
         axes.legend()
     return figure
-
-
-def _print_sentences(summary: dict[str, Any], out: Path) -> None:
-    from rich.console import Console
-
-    console = Console()
-    for line in summary["sentences"]:
-        console.print(line, highlight=False, markup=False)
-    console.print(f"written to {out}; run {out / 'tuned.yaml'}", highlight=False, markup=False)
