@@ -75,8 +75,8 @@ DRAWS: dict[str, Draw] = {
     "end": _one_of("lets go", "lets go", "jumps away", "holds on"),
     "seed": lambda u: int(u * 2**31),
     # Only with `--imperfect`.
-    "believed_stiffness": _even(0.8, 1.2),
-    "believed_damping": _even(0.8, 1.2),
+    "configured_stiffness_ratio": _even(0.8, 1.2),
+    "configured_damping_ratio": _even(0.8, 1.2),
     "motor_lag": _often(0.5, _even(0.0, 3e-3)),
     "resolution": _often(0.5, _even(0.0, 30e-6)),
     "noise": _often(0.5, _even(0.0, 0.5)),
@@ -201,11 +201,14 @@ def prepared(case: dict[str, Any], imperfect: bool) -> dict[str, Any]:
         mass = 1.0 - 0.2 * np.random.default_rng([case["seed"], 1]).random()
         model = dataclasses.replace(
             REFERENCE,
-            believed_mass=1.0 / mass,
+            configured_mass_ratio=1.0 / mass,
             master_resolution=case["resolution"],
             slave_resolution=case["resolution"] / 3,
             wrench_noise=case["noise"],
-            **{k: case[k] for k in ("believed_stiffness", "believed_damping", "motor_lag")},
+            **{
+                k: case[k]
+                for k in ("configured_stiffness_ratio", "configured_damping_ratio", "motor_lag")
+            },
         )
     return {
         "model": model,

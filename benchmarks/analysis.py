@@ -41,11 +41,11 @@ from drake_teleop.lab.analysis.one_axis import (
     hand_impedance,
 )
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED,
-    SAMPLE,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
     Sampling,
-    cut_period_map,
-    delay_steps,
+    delay_in_hand_periods,
+    period_map_of_cut_loop,
     sampled_two_port,
 )
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -89,8 +89,8 @@ def simulate(
     force = (axis.tool_mass, estimate, axis.sigma, axis.gamma, axis.force_scale)
     out = np.zeros((round(duration * sampling.hand_hz), 5))
     _simulate(
-        master, slave, servo, force, every, 1 / tick_hz, delay_steps(axis, sampling), sections,
-        substeps, start, out,
+        master, slave, servo, force, every, 1 / tick_hz, delay_in_hand_periods(axis, sampling),
+        sections, substeps, start, out,
     )  # fmt: skip
     return out
 
@@ -240,14 +240,14 @@ def continuous_margin(axis: OneAxis) -> float:
 
 def grows(axis: OneAxis, sampling: Sampling) -> bool:
     """Whether an eigenvalue of the closed loop with its registers is outside the unit circle."""
-    M, registers = cut_period_map(axis, sampling), 2 * delay_steps(axis, sampling)
+    M, registers = period_map_of_cut_loop(axis, sampling), 2 * delay_in_hand_periods(axis, sampling)
     n = len(M) - 3
     closed = np.diag(np.ones(n + registers - 1), -1)
     closed[: n + 1] = 0.0
     closed[:n, :n] = M[:n, :n]
     if registers:
-        closed[n, SAMPLE] = 1.0
-    closed[:n, n + registers - 1 if registers else SAMPLE] += M[:n, RECEIVED]
+        closed[n, SAMPLED_FORCE] = 1.0
+    closed[:n, n + registers - 1 if registers else SAMPLED_FORCE] += M[:n, RECEIVED_FORCE]
     return bool(np.abs(np.linalg.eigvals(closed)).max() > 1)
 
 

@@ -344,8 +344,8 @@ def _plan(file: ArmFile, folder: Path) -> dict[str, Any]:
     ):
         new_station.new_command(folder, file.path, file.frame, quiet=True)
     plan = planned["plan"]
-    figures = {"plan_s": planned["seconds"], "half_cube_m": float(plan.place.half)}
-    figures |= {"assumed": list(plan.assumptions), "note": plan.axis_note}
+    figures = {"plan_s": planned["seconds"], "half_cube_m": float(plan.place.cube_half_m)}
+    figures |= {"assumed": list(plan.assumptions), "note": plan.tool_axis_advice}
     return figures | start_figures(LoadScenario(folder / "station.yaml"), figures["assumed"])
 
 

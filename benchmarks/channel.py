@@ -12,7 +12,7 @@ import argparse
 import json
 from pathlib import Path
 
-from drake_teleop.lab.reproduction.speed import MakeMovingStation, cpu_seconds
+from drake_teleop.lab.reproduction.speed import MakeMovingStation, cpu_time_per_simulated_second
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -29,7 +29,7 @@ def main() -> None:
             direct, channel=Channel(network="internet"), passivity=PassivityConfig(method=method)
         )
         stations[method] = MakeMovingStation(over)
-    cost = cpu_seconds(stations)
+    cost = cpu_time_per_simulated_second(stations)
     figures = {name: cost[name] / cost["none"] for name in cost}
     print("cost of the whole station over that without a method on the same network")
     for name, figure in figures.items():

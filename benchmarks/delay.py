@@ -35,7 +35,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 
 PAPER, STIFF = 5100.0, 20000.0  # N/m
 JITTER, LOSS = (0.0, 0.25, 0.5), (0.0, 0.1, 0.3)
-LONGER = Task(release=19.5, released=20.5, end=25.0)
+LONGER = Task(release_start=19.5, release_end=20.5, end=25.0)
 
 # Method, wall [N/m], round trip [s].
 CASES = (

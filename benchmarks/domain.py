@@ -43,7 +43,7 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     """Figures of one hold: method, grip, stiffness of the wall, round trip."""
     method, grip, wall, round_trip = case
     longer = 10.0 if round_trip > 2.0 else 0.0
-    task = Task(release=11.5 + longer, released=12.5 + longer, end=17.0 + longer)
+    task = Task(release_start=11.5 + longer, release_end=12.5 + longer, end=17.0 + longer)
     mass, damping, stiffness = GRIPS[grip]
     model = dataclasses.replace(
         REFERENCE,
@@ -63,8 +63,8 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     quiet = found.chatter < QUIET * found.felt_force
     good = found.stable and quiet and abs(found.force_error) < EXACT
     share = found.felt_force / undelayed
-    holds = (run.t >= task.pressed + 2 * round_trip + SOON) & (run.t < task.release)
-    at_last = np.mean(run.felt[holds & (run.t >= task.release - task.judged)])
+    holds = (run.t >= task.press_end + 2 * round_trip + SOON) & (run.t < task.release_start)
+    at_last = np.mean(run.felt[holds & (run.t >= task.release_start - task.rest_window)])
     return {
         "stable": found.stable,
         "good": good,

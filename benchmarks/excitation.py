@@ -32,7 +32,12 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import LIMIT_SHARE, Problem, Task, minimise_criterion
+from drake_teleop.lab.excitation.optimizer import (
+    USABLE_LIMIT_SHARE,
+    DesignProblem,
+    DesignTask,
+    minimise_criterion,
+)
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
@@ -56,8 +61,8 @@ MOTION_NOISE = (0.06, 0.002, 1.5)
 GAIN, CROSS_TALK, DELAY, DRAWS = 0.01, 0.003, 1e-3, 16
 
 
-def task_of(robot: Robot, criterion: str, period: float) -> Task:
-    return Task(
+def task_of(robot: Robot, criterion: str, period: float) -> DesignTask:
+    return DesignTask(
         robot.arm.table, robot.limits, Criterion(criterion, robot.scales), robot.home, period, 5
     )
 
@@ -68,10 +73,10 @@ def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dic
     task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
     for seed in range(seeds):
-        found = minimise_criterion(Problem(task), seed=seed, seconds=later)
+        found = minimise_criterion(DesignProblem(task), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
             trajectory, _ = find_best_within_limits(
-                robot, [it for it in found if it.seconds <= seconds]
+                robot, [it for it in found if it.cpu_time_s <= seconds]
             )
             values[name].append(criterion_values(robot, trajectory)[criterion])
     start = time.thread_time()
@@ -86,7 +91,7 @@ class _TimeIsUpError(Exception):
 
 def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -> float:
     """kappa_w10 on the grid after so many seconds of SLSQP without gradients; inf: nothing."""
-    problem = Problem(task_of(robot, "kappa_w10", period))
+    problem = DesignProblem(task_of(robot, "kappa_w10", period))
     rng = np.random.default_rng(seed)
     candidates = [problem.candidate(rng, near_home=k % 2 == 0) for k in range(64)]
     merits = []
@@ -100,7 +105,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
         if time.thread_time() - start > seconds:
             raise _TimeIsUpError
         point = problem.evaluate(x, 12.0, 200.0)
-        if point.largest_use <= 1:
+        if point.largest_limit_use <= 1:
             best = min(best, problem.value())
         return point
 
@@ -109,7 +114,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda x: LIMIT_SHARE - evaluate(x).uses},
+            constraints={"type": "ineq", "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).uses},
             options={"maxiter": 1000},
         )
     return best

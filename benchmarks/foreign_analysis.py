@@ -37,7 +37,7 @@ from drake_teleop.lab.analysis.analyze import (
     sampling_of_scenario,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
-from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, bounded_figures
+from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, stiffest_stable_walls
 from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
@@ -108,7 +108,7 @@ def figures(scenario: Scenario) -> dict[str, Any]:
     )
     axis = along.axis
     H = absorb_impedances(with_hand, hand=-1j * OMEGA * axis.hand_mass)
-    limits = bounded_figures(H, axis, sampling)["each"]
+    limits = stiffest_stable_walls(H, axis, sampling)["each"]
     return {
         "joints": slave_arm(scenario).num_joints,
         "from the sampled axis, %": off(with_hand, axis, sampling),
@@ -186,7 +186,7 @@ def predicted(axis: OneAxis, stiffness: float, share: float, sampling: Sampling)
         dataclasses.replace(axis, wall_stiffness=stiffness, force_scale=scale), sampling
     )
     multiplier = abs(complex(dominant_multiplier(loop, axis.delay)))
-    return float(f"{multiplier ** ((_LAST - _FIRST) / float(loop.period)):.3g}")
+    return float(f"{multiplier ** ((_LAST - _FIRST) / float(loop.period_s)):.3g}")
 
 
 def slowest(scenario: Scenario, system: Linearization) -> dict[str, float]:

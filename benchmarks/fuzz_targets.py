@@ -115,7 +115,7 @@ def _study(path: Path) -> None:
         study.study_command(path, path.parent / "out", quiet=True)
     except _Enough:
         design = study.LoadStudy(path)
-        if design.size() <= 5000:
+        if design.num_points() <= 5000:
             design.points()
     finally:
         study.run_study = kept

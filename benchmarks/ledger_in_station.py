@@ -35,9 +35,9 @@ from scipy.integrate import cumulative_trapezoid
 
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
 from drake_teleop.lab.comparison.delayed_contact import (
-    LEAF_SPRINGS,
+    LEAF_THICKNESSES_M,
     delayed_contact,
-    station_figures,
+    figures_of_station_run,
 )
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
@@ -136,7 +136,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     began = time.thread_time()
     result = simulate(station, scenario.simulation, progress=False)
     spent = time.thread_time() - began
-    found = station_figures(result, scenario, task)
+    found = figures_of_station_run(result, scenario, task)
     accounts = station_accounts(result, scenario)
     accounts[:, HAND] += start_energy(scenario)
     if sigma > 0.0:
@@ -144,7 +144,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     inside, at_motors = (accounts[:, HAND] + accounts[:, place] for place in (ACTUAL, MOTOR))
     scale = scenario.force_scaling.force_scale
     rubbed = scale * friction_work(result, scenario)
-    held = (result.t >= task.release - task.judged) & (result.t < task.release)
+    held = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
     weight = sigma * scale * float(true_load(scenario)[6]) * 9.81
     contact = scale * float(result["true_contact_wrench_W"][held, 2].mean())
     felt = float(result["force_to_master"][held, 2].mean()) + weight
@@ -184,7 +184,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS))
-    parser.add_argument("--leaf", nargs="+", choices=list(LEAF_SPRINGS), default=list(LEAF_SPRINGS))
+    parser.add_argument(
+        "--leaf", nargs="+", choices=list(LEAF_THICKNESSES_M), default=list(LEAF_THICKNESSES_M)
+    )
     parser.add_argument("--grip", nargs="+", choices=GRIPS, default=list(GRIPS))
     parser.add_argument("--sigma", nargs="+", type=float, default=list(SIGMAS))
     parser.add_argument("--seed", type=int, default=0, help="of sensor and networks")

@@ -119,7 +119,7 @@ def architectures() -> dict[str, Any]:
     cells, model = {}, OneDof(hand_mass=0.2, hand_damping=5.0, hand_stiffness=300.0,
                               wall_stiffness=1000.0)  # fmt: skip
     for method, trip, loss in itertools.product(METHODS, _ROUND_TRIPS, _LOSSES):
-        task = Task(release=8.5 + 3 * trip, released=9.5 + 3 * trip, end=12.0 + 5 * trip)
+        task = Task(release_start=8.5 + 3 * trip, release_end=9.5 + 3 * trip, end=12.0 + 5 * trip)
         run = run_one_dof(
             model,
             PassivityConfig(method=method),
@@ -128,7 +128,7 @@ def architectures() -> dict[str, Any]:
             intent=operator_intent(task),
         )
         of = figures_of_run(run, model, task)
-        swing = (run.t > task.swing) & (run.t < task.swung)
+        swing = (run.t > task.swing_start) & (run.t < task.swing_end)
         apart = np.sqrt(np.mean((run.master - run.slave)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf
         cells[method, trip, loss] = 1e3 * float(apart), float(error)

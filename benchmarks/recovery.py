@@ -35,7 +35,15 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S
 
-TASK = Task(swing=0.3, swung=1.5, press=2.0, pressed=2.6, release=6.5, released=7.1, end=10.0)
+TASK = Task(
+    swing_start=0.3,
+    swing_end=1.5,
+    press_start=2.0,
+    press_end=2.6,
+    release_start=6.5,
+    release_end=7.1,
+    end=10.0,
+)
 GOOD_FROM, TIMEOUT, LIMIT = 4.5, 0.1, 5.0  # s, s, N
 
 
@@ -60,7 +68,7 @@ class Row:
         still = np.ptp(run.master[end]) < 0.5e-3
         self.runs += 1
         self.recovered += bool(beside < 2e-3 and at_rest < 0.1 and still)  # never if not finite
-        silent = run.silent[:, 0] > TIMEOUT
+        silent = run.time_without_packets[:, 0] > TIMEOUT
         grown = np.diff(felt, prepend=0.0)[_resuming(silent)]
         self.silences += int((np.diff(silent.astype(int)) < 0).sum())
         worst = dict(

@@ -68,7 +68,7 @@ def reached(
     records: int,
 ) -> float:
     """Share of the records in which all asked numbers are within their tolerances."""
-    sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.phi
+    sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
     motions = empty_motions(*joints[0].shape)

@@ -24,7 +24,11 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
+from drake_teleop.lab.reproduction.speed import (
+    MakeBarePlant,
+    MakeMovingStation,
+    cpu_time_per_simulated_second,
+)
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -154,7 +158,9 @@ def rates(free: Scenario) -> dict[str, float]:
         "2_khz": replace(free, rates__sensor_hz=2000.0),
         "1_khz": replace(free, rates__sensor_hz=1000.0, wrist_sensor__bandwidth_hz=400.0),
     }
-    cost = cpu_seconds({name: MakeMovingStation(s) for name, s in sensors.items()})
+    cost = cpu_time_per_simulated_second(
+        {name: MakeMovingStation(s) for name, s in sensors.items()}
+    )
     return {f"real_time_factor_sensor_{name}": 1 / seconds for name, seconds in cost.items()}
 
 

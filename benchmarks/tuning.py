@@ -33,7 +33,7 @@ from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import GammaSearch, Settings, StationTrial
 from drake_teleop.lab.tuning.search import meets_requirements
-from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
+from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -66,7 +66,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     name, scenario, network = drawn(rng)
     row: dict[str, Any] = {"station": name}
     began, cpu = time.monotonic(), time.process_time()
-    stated = stated_set(HANDS, WALLS, TASK)
+    stated = make_stated_set(HANDS, WALLS, TASK)
     with tempfile.TemporaryDirectory() as folder:
         try:
             found = tune(

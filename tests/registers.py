@@ -6,24 +6,24 @@ import numpy as np
 
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED,
-    SAMPLE,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
     Sampling,
-    cut_period_map,
-    delay_steps,
+    delay_in_hand_periods,
+    period_map_of_cut_loop,
 )
 
 
 def closed_map(axis: OneAxis, sampling: Sampling) -> np.ndarray:
     """Return the matrix of the closed loop over a hand period; registers delay the force."""
-    M, registers = cut_period_map(axis, sampling), 2 * delay_steps(axis, sampling)
+    M, registers = period_map_of_cut_loop(axis, sampling), 2 * delay_in_hand_periods(axis, sampling)
     n = len(M) - 3
     closed = np.zeros((n + registers, n + registers))
     closed[:n, :n] = M[:n, :n]
-    source = n + registers - 1 if registers else SAMPLE
-    closed[:n, source] += M[:n, RECEIVED]
+    source = n + registers - 1 if registers else SAMPLED_FORCE
+    closed[:n, source] += M[:n, RECEIVED_FORCE]
     for k in range(registers):
-        closed[n + k, n + k - 1 if k else SAMPLE] = 1.0
+        closed[n + k, n + k - 1 if k else SAMPLED_FORCE] = 1.0
     return closed
 
 

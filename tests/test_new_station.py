@@ -19,7 +19,7 @@ from drake_teleop.lab import new_station
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.new_station import new_command, place, plan_station
-from drake_teleop.lab.new_station.place import Place, find_place
+from drake_teleop.lab.new_station.place import StartPlace, find_start_place
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.home import R_WS_HOME
@@ -58,13 +58,13 @@ def test_station_is_written_and_run(tmp_path, runs, capsys):
     plan = plan_station(ARM, "sensor", device="omega_6")
     scale = scenario.kinematic_scaling.translation_scale
     # The scaled device workspace is reachable, and the hand stays inside the device workspace.
-    assert 0.055 * scale <= plan.place.half
-    way = 1.5 * plan.swing + 0.01
+    assert 0.055 * scale <= plan.place.cube_half_m
+    way = 1.5 * plan.swing_amplitude_m + 0.01
     assert way / scale <= 0.113 / 2
     # From the tool's lowest point onto the wall, at most 1 cm deep.
     tip = NominalSlave(scenario.slave).start_tip
     wall = scenario.environment[0].position[2]
-    assert wall == pytest.approx(tip[2] - 1.5 * plan.swing, abs=1e-3)
+    assert wall == pytest.approx(tip[2] - 1.5 * plan.swing_amplitude_m, abs=1e-3)
     into = -scenario.operator.intent[1].translation[2] * scale - (tip[2] - wall)
     assert 0.0 < into <= 0.0101
     with pytest.raises(DrakeTeleopError, match="already exists"):
@@ -82,15 +82,15 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
 @pytest.mark.long
 def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
-    found = find_place(arm)
+    found = find_start_place(arm)
     assert found.position[0] > abs(found.position[1]) and found.position[2] > 0.1
     w = R_WS_HOME.ToQuaternion().wxyz()
     for signs in product((-1.0, 1.0), repeat=3):
-        pose = np.array([*w, *(found.position + found.half * np.array(signs))])
+        pose = np.array([*w, *(found.position + found.cube_half_m * np.array(signs))])
         assert find_posture(arm, pose, found.q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
     with pytest.raises(DrakeTeleopError, match="no posture found in which z_S points down"):
-        find_place(stiff)
+        find_start_place(stiff)
 
 
 @pytest.mark.long
@@ -105,12 +105,12 @@ def test_rates_match_the_device(tmp_path, runs, device):
 
 
 def test_joint_margin_counts_more_than_cube_size():
-    best = Place(np.zeros(7), True, np.zeros(6), half=0.15, room=0.2)
+    best = StartPlace(np.zeros(7), True, np.zeros(6), cube_half_m=0.15, joint_margin=0.2)
     worse = [
-        best._replace(half=0.3, room=0.01),
-        best._replace(half=0.3, by_position=False),
-        best._replace(half=0.03, room=0.9),
-        best._replace(half=0.0, room=0.0),
+        best._replace(cube_half_m=0.3, joint_margin=0.01),
+        best._replace(cube_half_m=0.3, is_set_by_position=False),
+        best._replace(cube_half_m=0.03, joint_margin=0.9),
+        best._replace(cube_half_m=0.0, joint_margin=0.0),
     ]
     assert max([*worse, best], key=place._place_merit) is best
 
@@ -146,7 +146,7 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
     frame = f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>'
     path.write_text(text.replace("</model>", f"{frame}</model>", 1))
     plan = plan_station(path, "ft")
-    assert (plan.axis_note, plan.tip, plan.place.by_position) == ("", [], True)
+    assert (plan.tool_axis_advice, plan.tip_S, plan.place.is_set_by_position) == ("", [], True)
 
 
 def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
@@ -158,7 +158,7 @@ def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, run
     path = tmp_path / "arm.sdf"
     path.write_text(text[:lower] + "<lower>1.2</lower><upper>1.9" + text[end:])
     plan = plan_station(path, "sensor")
-    assert not plan.place.by_position
+    assert not plan.place.is_set_by_position
     new_command(tmp_path / "mine", path, "sensor")
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     start = NominalSlave(slave)
@@ -178,7 +178,7 @@ def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeyp
     start = NominalSlave(slave)
     assert len(slave.home) == start.arm.num_joints == 5
     assert RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()[2, 2] < -0.95
-    half, p_WS = plan_station(path, "sensor").place.half, start.X_WS_start[4:]
+    half, p_WS = plan_station(path, "sensor").place.cube_half_m, start.X_WS_start[4:]
     assert half >= 0.03
     for way in np.vstack([np.eye(3), -np.eye(3)]):
         target, reached = start.X_WS_start + half * np.append(np.zeros(4), way), np.empty(7)

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
-from drake_teleop.lab.run_summary import _detection_figures, is_in_contact
+from drake_teleop.lab.run_summary import _detection_delays, is_in_contact
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
@@ -244,4 +244,4 @@ def test_detection_delay_is_empty_without_contact():
     specs = [SIGNALS[name] for name in signals]
     result = SimulationResult(np.arange(4.0), signals, specs)
     expected = {"contact_noticed_ms": [], "contact_at_hand_ms": [], "false_contacts": 1}
-    assert _detection_figures(result, []) == expected
+    assert _detection_delays(result, []) == expected

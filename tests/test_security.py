@@ -209,7 +209,7 @@ STUDY = (
 def test_a_pickle_that_is_planted_in_a_study_is_not_run(tmp_path, monkeypatch):
     """Under every name that a study has, or ever had."""
     monkeypatch.setattr(
-        "drake_teleop.lab.studies.study.StationWork.__call__",
+        "drake_teleop.lab.studies.study.StationRunFunction.__call__",
         lambda self, values, seed: {"hand_work_J": 1.0},
     )
     path, out, done = tmp_path / "study.yaml", tmp_path / "out", tmp_path / "done"

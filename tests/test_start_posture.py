@@ -9,7 +9,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_place
+from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_start_place
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
@@ -101,11 +101,13 @@ def plain(tmp_path_factory):
 
 
 def elbow_of(plan):
-    return elbow_up_share(postures_at(plan.shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+    return elbow_up_share(postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
 
 
 def slave_of(plan, path):
-    return Slave(model=str(path), sensor_frame="ft", tool=plan.tool, home=plan.place.q.tolist())
+    return Slave(
+        model=str(path), sensor_frame="ft", tool=plan.stand_in_tool, home=plan.place.q.tolist()
+    )
 
 
 def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
@@ -114,12 +116,14 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     path = write_arm(tmp_path / "arm.urdf", ranges=trap)
     plan = plan_station(path, "ft")
     assert elbow_of(plan) > 0.5
-    plan.shapes.move_to(plan.place.q)
+    plan.posture_shapes.move_to(plan.place.q)
     # The base link has a plate on the plane; everything that moves is above it.
-    assert plan.plane == pytest.approx(0.0, abs=1e-9)
-    assert plan.shapes.points_on_bodies(plan.shapes.moving_bodies())[:, 2].min() > 0.02
+    assert plan.base_plane_height == pytest.approx(0.0, abs=1e-9)
+    assert (
+        plan.posture_shapes.points_on_bodies(plan.posture_shapes.moving_bodies())[:, 2].min() > 0.02
+    )
     assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == ()
-    assert wall_of_plan(plan).position[2] < plan.lowest[2] - 0.01
+    assert wall_of_plan(plan).position[2] < plan.lowest_tool_point_W[2] - 0.01
 
 
 def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
@@ -133,7 +137,7 @@ def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
 def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
     path = write_arm(tmp_path / "arm.urdf", base=f"0.4 -0.5 {height} 0 0 0")
     plan = plan_station(path, "ft")
-    assert plan.plane == pytest.approx(height, abs=1e-6)
+    assert plan.base_plane_height == pytest.approx(height, abs=1e-6)
     assert height < plan.place.position[2] < height + 0.9
     assert np.hypot(*(plan.place.position[:2] - [0.4, -0.5])) > 0.25
 
@@ -142,7 +146,7 @@ def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
     assert start_overlaps(slave, wall_of_plan(plan))[0] == ()
-    elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
+    elbow = postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
         text for text in start_overlaps(slave, Wall(position=list(elbow)))[0] if "link3" in text
     ]
@@ -151,7 +155,7 @@ def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
 
 
 def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain):
-    arm = plain[1].shapes.arm
+    arm = plain[1].posture_shapes.arm
     endless = replace(
         arm,
         lower=np.array([-np.inf, *arm.lower[1:5], -np.inf]),
@@ -161,21 +165,21 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain
     assert np.isfinite(drawn).all() and np.abs(drawn).max() <= np.pi
     assert joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
     assert joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(0.5)
-    found = find_place(endless)
-    assert found.half > 0.0 and np.isfinite(found.q).all()
+    found = find_start_place(endless)
+    assert found.cube_half_m > 0.0 and np.isfinite(found.q).all()
 
 
 def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
-    arm = plain[1].shapes.arm
+    arm = plain[1].posture_shapes.arm
     tilted = replace(arm, lower=arm.lower * 0.0 - 0.2, upper=arm.upper * 0.0 + 0.2)
     with pytest.raises(DrakeTeleopError, match=r"in 20000 z_S is more than 40 degrees from down"):
-        find_place(tilted)
+        find_start_place(tilted)
     with pytest.raises(DrakeTeleopError, match=r"in \d+ S is too near .*; 0 are left"):
-        find_place(arm, plane=5.0)
+        find_start_place(arm, plane=5.0)
 
 
 def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
-    arm = plain[1].shapes.arm
+    arm = plain[1].posture_shapes.arm
     at_random = random_postures(arm)
     for k in (0, 17, 4000):
         pose = np.empty(7)
@@ -199,14 +203,14 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     # The hull of the forearm encloses the wrist, two joints further, in all postures.
     text = path.read_text().replace('<box size="0.06 0.06 0.3"/>', '<box size="0.3 0.3 0.9"/>', 1)
     path.write_text(text)
-    shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool))
+    shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].stand_in_tool))
     shapes.move_to(np.full(6, 0.3))
     assert not any(
         {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.overlaps()
     )
     (said,) = [text for text in shapes.assumptions if "overlaps left out" in text]
     assert "link3 and link5" in said and "link1" not in said
-    slave = Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool, home=[0.3] * 6)
+    slave = Slave(model=str(path), sensor_frame="ft", tool=plain[1].stand_in_tool, home=[0.3] * 6)
     assert said in start_overlaps(slave, None)[1]
 
 
@@ -217,7 +221,7 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
     link = '<link name="link4">'
     path.write_text(path.read_text().replace(link, f"{link}{plate}</collision>"))
     plan = plan_station(path, "ft")
-    shapes = plan.shapes
+    shapes = plan.posture_shapes
     random = np.random.default_rng(8).uniform(shapes.arm.lower, shapes.arm.upper, (200, 6))
     counts = []
     for q in random:
@@ -225,12 +229,14 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
         near = [{each.first.name(), each.second.name()} for each in shapes.overlaps()]
         counts.append({"link2", "link4"} in near)
     assert 0.6 < np.mean(counts) < 0.95
-    assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == () == plan.overlaps
+    assert (
+        start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == () == plan.overlap_warnings
+    )
     assert not any("link2 and link4" in text for text in plan.assumptions)
 
 
 def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
-    shapes = plain[1].shapes
+    shapes = plain[1].posture_shapes
     postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
     usable, clear, clear_of_all = _rows_to_solve(shapes.arm, postures, region, shapes)
     expected = _usable_rows(shapes.arm, postures.q)
@@ -311,8 +317,8 @@ def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
     kept, region = select_suitable_postures(
         Postures(np.zeros((count, 4)), origins, axes, R_WS, p_WS), 0.0, 0.1
     )
-    assert region.raised.tolist() == [False, False, True, True]
-    assert region.removed[2] == ("a joint is below the base plane", 20)
+    assert region.is_joint_above_plane.tolist() == [False, False, True, True]
+    assert region.removed_counts[2] == ("a joint is below the base plane", 20)
     assert (kept.origins[:, 3, 2] > 0.0).all() and len(kept.q) > 0
 
 

@@ -173,7 +173,7 @@ def little_work(monkeypatch):
     monkeypatch.setattr(runs, "draw_overview", lambda result: Figure())
     monkeypatch.setattr(replay, "write_replay", lambda path, *_: write_text(path, "film"))
     monkeypatch.setattr(
-        studies.StationWork, "__call__", lambda self, values, seed: {"hand_work_J": 1.0}
+        studies.StationRunFunction, "__call__", lambda self, values, seed: {"hand_work_J": 1.0}
     )
     painted = Figure.savefig
     monkeypatch.setattr(
@@ -224,7 +224,7 @@ def test_study_continues_after_a_full_disk(tmp_path, monkeypatch, little_work):
         study(out)
     calls = []
     monkeypatch.setattr(
-        studies.StationWork, "__call__", lambda self, values, seed: calls.append(seed) or {}
+        studies.StationRunFunction, "__call__", lambda self, values, seed: calls.append(seed) or {}
     )
     study(out)
     assert len(calls) == 1

@@ -14,7 +14,7 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 model, gone = OneDof(), 3000  # the station's grip and servo; ms
-task = Task(0.1, 0.6, 0.7, 1.5, release=9.0, released=10.0, end=4.0, judged=0.1)
+task = Task(0.1, 0.6, 0.7, 1.5, release_start=9.0, release_end=10.0, end=4.0, rest_window=0.1)
 intent = operator_intent(task)
 grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(intent), 1))
 grip[gone:] = 0.0

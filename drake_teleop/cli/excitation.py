@@ -21,7 +21,7 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
-from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench
@@ -118,7 +118,13 @@ def excite_command(
             )
             report(1.0)
             found = result.excitation
-            shares = dict(zip(tolerance.required_entry_names, result.reached.tolist(), strict=True))
+            shares = dict(
+                zip(
+                    tolerance.required_entry_names,
+                    result.errors_over_tolerances.tolist(),
+                    strict=True,
+                )
+            )
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
@@ -126,7 +132,7 @@ def excite_command(
         write_table(out / "trajectory.csv", trajectory_table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
         write_picture(out / "excitation.png", draw_trajectory(found))
-        write_motion_film(out / "excitation.html", found)
+        write_motion_replay(out / "excitation.html", found)
         write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -156,14 +162,15 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
-            use.limit: {"share": use.share, "where": use.what, "t": use.time} for use in found.uses
+            use.limit_name: {"share": use.used_share, "where": use.where, "t": use.time_s}
+            for use in found.uses
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
             for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
         "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
-        "heaviest_load_kg": float(robot.limits.phi[0]),
+        "heaviest_load_kg": float(robot.limits.heaviest_phi[0]),
         "assumed": list(robot.assumptions),
     }
 
@@ -209,11 +216,11 @@ def _draw_joints(axes: Axes, found: Excitation) -> None:
 def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
     limits = found.robot.limits
     s, omega, alpha = sensor_motion(found.robot, found.trajectory)
-    wrench = non_contact_wrench(s, omega, alpha, limits.phi)
+    wrench = non_contact_wrench(s, omega, alpha, limits.heaviest_phi)
     t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (
-        (forces, wrench[:, :3], limits.sensor[0], "N"),
-        (torques, wrench[:, 3:], limits.sensor[1], "N m"),
+        (forces, wrench[:, :3], limits.max_sensor_norms[0], "N"),
+        (torques, wrench[:, 3:], limits.max_sensor_norms[1], "N m"),
     ):
         axes.plot(t, part, linewidth=0.9, label=list("xyz"))
         axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")

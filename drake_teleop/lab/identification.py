@@ -215,7 +215,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
             remedy="set simulation.duration to the period",
         )
     worst = check_trajectory(robot, trajectory)[0]
-    if worst.share > 1:
+    if worst.used_share > 1:
         raise DrakeTeleopError(
             f"uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"
         )

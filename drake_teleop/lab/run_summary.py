@@ -52,20 +52,14 @@ def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
     return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_TAIL_S
 
 
-def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] in S with the final load estimate."""
-    estimate = result["load_estimate"][-1]
-    check_nonzero_load("load_estimate", estimate[6:])
-    wrench, s, omega, alpha = sensor_samples(result)
-    return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
-
-
 def summarise(run: ScenarioRun) -> dict[str, Any]:
     """Return the content of summary.json without the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
-    measured = result["measured_wrench_S"] - estimate[:6]
-    calculated = calculated_contact_wrench(result)
+    check_nonzero_load("load_estimate", estimate[6:])
+    wrench, s, omega, alpha = sensor_samples(result)
+    measured = wrench - estimate[:6]
+    calculated = contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
     free = _since_contact_s(contact, result.t) > FILTER_TAIL_S
@@ -90,7 +84,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     if "force_to_master" in result:
         summary |= _peak_values("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
-        summary |= _detection_figures(result, contact_spans(result.t, contact))
+        summary |= _detection_delays(result, contact_spans(result.t, contact))
     if beyond := _describe_unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
     summary |= _body_displacements(result)
@@ -114,9 +108,7 @@ def draw_overview(result: SimulationResult) -> Figure:
     return figure
 
 
-def _detection_figures(
-    result: SimulationResult, spans: list[tuple[float, float]]
-) -> dict[str, Any]:
+def _detection_delays(result: SimulationResult, spans: list[tuple[float, float]]) -> dict[str, Any]:
     t, summary = result.t, {}
     for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
         flagged = t[result[name][:, 0] > 0]

@@ -89,9 +89,9 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
             continue
         i = rng.choice(failing)
         w, loads = OMEGA[i], ab.worst_loads(H[i])
-        assert loads.resistance < 0
+        assert loads.loop_resistance < 0
 
-        def environment(s, x=loads.environment, w=w):
+        def environment(s, x=loads.environment_reactance, w=w):
             return s * x / w if x > 0 else -w * x / s
 
         def felt(s, axis=axis, environment=environment):
@@ -99,14 +99,14 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
 
         # The hand's reactance is made of a spring and a mass that dominates the loop's.
         slope = abs(felt(1j * w * 1.0001) - felt(1j * w)) / (1e-4 * w)
-        mass = max(100 * slope, 100 * abs(loads.resistance) / w, abs(loads.hand) / w)
-        spring = mass * w**2 - loads.hand * w
+        mass = max(100 * slope, 100 * abs(loads.loop_resistance) / w, abs(loads.hand_reactance) / w)
+        spring = mass * w**2 - loads.hand_reactance * w
         assert spring >= 0
 
         def around(s, mass=mass, spring=spring, felt=felt):
             return mass * s + spring / s + felt(s)
 
-        s = 1j * w - loads.resistance / (2 * mass)
+        s = 1j * w - loads.loop_resistance / (2 * mass)
         for _ in range(20):
             step = 1e-6 * abs(s)
             s = s - around(s) * 2 * step / (around(s + step) - around(s - step))

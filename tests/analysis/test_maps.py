@@ -81,7 +81,7 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
     rng = np.random.default_rng(1)
     for i, j in rng.integers((len(found.y), len(found.x)), size=(6, 2)):
         cell = {found.x_name: found.x[j], found.y_name: found.y[i]}
-        assert grows(axis, sampling, **cell) == (found.unstable[i, j] > 0), cell
+        assert grows(axis, sampling, **cell) == (found.num_unstable_multipliers[i, j] > 0), cell
 
 
 @pytest.mark.long

@@ -26,16 +26,16 @@ from drake_teleop.lab.analysis.cut_loop import (
 )
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import (
-    RECEIVED,
-    SAMPLE,
-    V_M,
-    V_S,
-    X_M,
-    X_S,
+    MASTER_V,
+    MASTER_X,
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
+    SLAVE_V,
+    SLAVE_X,
     Sampling,
-    _held_response,
-    cut_period_map,
-    delay_steps,
+    _spring_response,
+    delay_in_hand_periods,
+    period_map_of_cut_loop,
     sampled_two_port,
 )
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -90,10 +90,10 @@ def test_loop_agrees_with_a_simulation_with_small_steps(
     simulated = bench.simulate(axis, sampling, start, 0.1, 20)
     step = closed_map(axis, sampling)
     state = np.zeros(len(step))
-    state[[X_M, V_M, X_S, V_S]] = start
+    state[[MASTER_X, MASTER_V, SLAVE_X, SLAVE_V]] = start
     outputs = np.empty_like(simulated)
     for row in outputs:
-        row[:] = state[[X_M, V_M, X_S, V_S, SAMPLE]]
+        row[:] = state[[MASTER_X, MASTER_V, SLAVE_X, SLAVE_V, SAMPLED_FORCE]]
         state = step @ state
     np.testing.assert_allclose(
         outputs / np.abs(simulated).max(axis=0),
@@ -156,7 +156,7 @@ def test_two_port_tends_to_the_continuous_one_for_short_periods() -> None:
     ("delay", "steps"), [(0.0, 0), (1e-6, 1), (2e-4, 1), (7e-4, 1), (8e-4, 2), (1e-2, 20)]
 )
 def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: int) -> None:
-    assert delay_steps(OneAxis(delay=delay), STATION) == steps
+    assert delay_in_hand_periods(OneAxis(delay=delay), STATION) == steps
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])
@@ -173,16 +173,16 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, ste
     port[:, 0, 0] -= device
     H[:, 0, 0] -= device
     np.testing.assert_allclose(H, port * late, atol=1e-9)
-    M = cut_period_map(bare, sampling)
+    M = period_map_of_cut_loop(bare, sampling)
     n = len(M) - 3
     A = M[:n, :n].copy()
-    A[:, SAMPLE] += M[:n, RECEIVED]
+    A[:, SAMPLED_FORCE] += M[:n, RECEIVED_FORCE]
     inner = z[:, None, None] * np.eye(n) - A
     response = np.linalg.solve(inner, np.broadcast_to(M[:n, n : n + 2], (len(w), n, 2)))
     hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
     port[:, 0, 0] += device
     for force in range(2):
-        v_m, v_s = response[:, V_M, force] / hold, response[:, V_S, force] / hold
+        v_m, v_s = (response[:, MASTER_V, force] / hold, response[:, SLAVE_V, force] / hold)
         F = np.array([1 - force, force])
         np.testing.assert_allclose(port[:, 0, 0] * v_m + port[:, 0, 1] * F[1], F[0], atol=1e-9)
         np.testing.assert_allclose(
@@ -225,7 +225,10 @@ def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
     delay = np.array([[0.02], [2.0]])
     found = dominant_multiplier(loop, delay)
     assert found.shape == (2, 2)
-    back = 1 - np.prod((found[..., None] - loop.closed) / (found[..., None] - loop.open), axis=-1)
+    back = 1 - np.prod(
+        (found[..., None] - loop.closed_multipliers) / (found[..., None] - loop.open_multipliers),
+        axis=-1,
+    )
     np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
     one = growth_rate(OneAxis(delay=0.02), STATION)
     assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
@@ -326,7 +329,7 @@ def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: 
 def test_arrays_of_parameters_equal_single_loops() -> None:
     k, sigma = np.array([[0.0], [5.1e3], [2e4]]), np.array([0.0, 1.0])
     both = cut_loop(replace(OneAxis(), wall_stiffness=k, sigma=sigma), JR3)
-    assert both.open.shape == (3, 2, 10)
+    assert both.open_multipliers.shape == (3, 2, 10)
     margins = delay_margin(both)
     w = np.array([1.0, 20.0])
     responses = loop_response(both, w, 0.01)
@@ -358,7 +361,7 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(
-        _held_response(w**2, 0.0, np.array([t])),
+        _spring_response(w**2, 0.0, np.array([t])),
         ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
         strict=True,
     ):

@@ -30,13 +30,24 @@ pytestmark = pytest.mark.long
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
     monkeypatch.setattr(study, "NETWORK_IMPAIRMENTS", ((0.0, 0.0),))
-    monkeypatch.setattr(study, "LEAF_SPRINGS", {"contact": study.LEAF_SPRINGS["contact"]})
+    monkeypatch.setattr(
+        study, "LEAF_THICKNESSES_M", {"contact": study.LEAF_THICKNESSES_M["contact"]}
+    )
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
-        study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
+        study, "_INJECTED_ENERGY_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
     )
     # Use the load of the shipped scenario, which other tests have identified.
-    task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
+    task = Task(
+        0.1,
+        1.1,
+        press_start=1.2,
+        press_end=2.0,
+        release_start=3.0,
+        release_end=3.8,
+        end=4.8,
+        rest_window=0.6,
+    )
     monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
@@ -115,7 +126,11 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     )
     study._run_station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]
-    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RUN_RATES)
+    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
+        0.3,
+        3,
+        study._STATION_RATES,
+    )
     assert base.surroundings is None and base.contact_detection is None
     # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"

@@ -6,7 +6,7 @@ import pytest
 
 from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
-from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_force_traces
+from drake_teleop.lab.comparison.report import draw_decision_table, draw_energy, draw_force_traces
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
@@ -45,7 +45,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
 def test_cell_has_the_first_verdict_that_applies(changes, words, share):
     (cell,) = decision_table(summary(**changes)).values()
     assert (cell.verdict_text, cell.displayed_share) == (words, share)
-    (axes,) = draw_decision(summary(**changes)).axes
+    (axes,) = draw_decision_table(summary(**changes)).axes
     written = [text.get_text() for text in axes.texts]
     assert words in written[0] and len(written) == 3
 
@@ -59,7 +59,7 @@ def test_cell_has_the_first_verdict_that_applies(changes, words, share):
     ],
 )
 def test_unstable_cell_has_leaf_and_motion(figures, words):
-    (axes,) = draw_decision(summary(stable=False, **figures)).axes
+    (axes,) = draw_decision_table(summary(stable=False, **figures)).axes
     assert [text.get_text() for text in axes.texts][1:] == ["at rest", words]
 
 

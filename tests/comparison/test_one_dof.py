@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import brentq
 
 from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin
-from drake_teleop.lab.analysis.one_axis import Axis, OneAxis, servo_response
+from drake_teleop.lab.analysis.one_axis import AxisParameters, OneAxis, servo_response
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
@@ -176,7 +176,9 @@ def test_longest_round_trip_without_a_method(model, longest):
 
 @pytest.mark.parametrize("model", [OneDof(), REFERENCE])
 def test_simulation_and_linear_analysis_agree(model):
-    shared = {entry.name: getattr(model, entry.name) for entry in dataclasses.fields(Axis)}
+    shared = {
+        entry.name: getattr(model, entry.name) for entry in dataclasses.fields(AxisParameters)
+    }
     axis, fast = OneAxis(**shared, device_damping=DEVICE_DAMPING), 1e5
     margin = float(delay_margin(cut_loop(axis, Sampling(fast, fast, fast))))
     damped = dataclasses.replace(
@@ -197,7 +199,15 @@ def test_same_seed_gives_same_run():
 
 
 def test_energy_balances_agree_with_spring_and_inertia():
-    task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
+    task = Task(
+        swing_start=0.1,
+        swing_end=0.7,
+        press_start=0.7,
+        press_end=1.0,
+        release_start=1.3,
+        release_end=1.5,
+        end=2.0,
+    )
     model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operator_intent(task), 10
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
@@ -213,7 +223,7 @@ def test_energy_balances_agree_with_spring_and_inertia():
     np.testing.assert_allclose(motor, actual - moving, rtol=0.0, atol=6e-4)
     still = np.abs(speed) < 1e-4
     np.testing.assert_allclose(motor[still], actual[still], rtol=0.0, atol=1e-6)
-    np.testing.assert_array_equal(hand, run.energy[:, 0])
+    np.testing.assert_array_equal(hand, run.channel_energy[:, 0])
     assert run.least_energy_sum(HAND) == hand.min()
     # The command's balance also contains the energy in the servo's lag.
     wrench, lag = scale * run.wall, run.command - run.slave
@@ -266,7 +276,7 @@ def test_changing_hand_wall_and_imperfections():
     assert run.accounts[749, ACTUAL] == run.accounts[-1, ACTUAL]
     noise = run.felt[50:590] / model.force_scale
     assert noise.std() == pytest.approx(0.5, rel=0.15)
-    assert run.master[749] < 0.019 and np.all(run.silent[-1] > 0.09)
+    assert run.master[749] < 0.019 and np.all(run.time_without_packets[-1] > 0.09)
     step_addresses = np.round(run.command[600:800] / 30e-6) * 30e-6
     np.testing.assert_allclose(run.command[600:800], step_addresses, atol=1e-15)
 
@@ -305,12 +315,12 @@ def test_adversary_is_reproducible_and_finds_leaks_and_cycles(
 )
 def test_rise_delay_is_never_negative(share, late, drag, expected):
     task, t = Task(), np.arange(round(Task().end / PERIOD)) * PERIOD
-    middle = 0.5 * (task.press + task.pressed)
+    middle = 0.5 * (task.press_start + task.press_end)
 
     def wall(now):
         return np.clip((now - middle) / 0.4, 0.0, 1.0)
 
-    pulled = np.where((t > task.press) & (t < middle + 0.25), drag, 0.0)
+    pulled = np.where((t > task.press_start) & (t < middle + 0.25), drag, 0.0)
     felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
     still = np.zeros_like(t)
     found = figures_of_traces(

@@ -30,7 +30,7 @@ from drake_teleop.lab.excitation.limits import (
     write_link_motions,
     write_sensor_motion,
 )
-from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.optimizer import Iterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -88,14 +88,14 @@ def test_design_for_the_slave_has_a_good_criterion_within_all_limits(slave, desi
     assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
     _, qd, qdd = designed.trajectory.evaluate(np.array([0.0, 6.0]))
     np.testing.assert_allclose([qd, qdd], 0, atol=1e-12)
-    names = {use.limit for use in designed.uses}
+    names = {use.limit_name for use in designed.uses}
     assert names == {
         "position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance"
     }  # fmt: skip
-    assert all(0 < use.share <= 1 for use in designed.uses)
+    assert all(0 < use.used_share <= 1 for use in designed.uses)
     # A limit must be active, otherwise the optimum would be larger.
-    assert designed.uses[0].share > 0.97
-    assert slave.limits.phi[0] == pytest.approx(1.3 * 3.13)
+    assert designed.uses[0].used_share > 0.97
+    assert slave.limits.heaviest_phi[0] == pytest.approx(1.3 * 3.13)
 
 
 @pytest.mark.slow
@@ -119,12 +119,12 @@ def test_executed_motion_respects_the_limits(slave):
     assert 0.01 < np.abs(q - asked).max() < 0.2
     uses = check_motion(slave, t, q, qd, np.gradient(qd, t, axis=0))
     assert len(uses) == len(LIMIT_NAMES)
-    assert all(use.share < 0.995 for use in uses)
+    assert all(use.used_share < 0.995 for use in uses)
     # Torque of the motors, and samples of the sensor.
     limits, wrench = slave.limits, found.result["measured_wrench_S"]
-    assert np.all(np.abs(found.result["joint_torque"]) < limits.effort)
+    assert np.all(np.abs(found.result["joint_torque"]) < limits.max_torques)
     norms = [np.linalg.norm(wrench[:, part], axis=1).max() for part in (slice(0, 3), slice(3, 6))]
-    assert np.all(np.array(norms) < limits.sensor[:2])
+    assert np.all(np.array(norms) < limits.max_sensor_norms[:2])
     assert not found.result["saturated"].any()
 
 
@@ -153,12 +153,12 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
             np.testing.assert_allclose(frames[-1].translation(), p, atol=1e-9)
             np.testing.assert_allclose(frames[-1].rotation().matrix(), R, atol=1e-9)
         force, speed = film.readings
-        assert force.values.max() < slave.limits.sensor[0]
+        assert force.values.max() < slave.limits.max_sensor_norms[0]
         assert speed.values[0] < 0.05 < speed.values.max()
         assert film.slow_motion == 1.0
 
     monkeypatch.setattr(ReplayFile, "write", write)
-    write_motion_film(tmp_path / "film.html", short)
+    write_motion_replay(tmp_path / "film.html", short)
     assert np.linalg.norm(frames[1].translation() - frames[0].translation()) > 0.02
 
 
@@ -177,7 +177,7 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
 def test_predicted_and_observed_scatter_agree(slave, short, source):
     """200 noisy records of one motion; the noise-free sensor input is calculated once."""
     sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(source), 1 / 2000
-    table, phi = slave.arm.table, slave.limits.phi / 1.3
+    table, phi = slave.arm.table, slave.limits.heaviest_phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
     motions = empty_motions(*joints[0].shape)
@@ -204,7 +204,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
 @pytest.mark.slow
 def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     motion = sensor_motion(slave, designed.trajectory)
-    predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
+    predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.heaviest_phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
     # Deviations: encoders only < fused < accelerometer only.
     encoders, fused, accelerometer = (
@@ -212,7 +212,7 @@ def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
             *motion,
             1e-3,
             sensor_noise(WristSensorConfig(), MotionEstimationConfig(source), 6, 1 / 8000),
-            slave.limits.phi,
+            slave.limits.heaviest_phi,
         )
         for source in ("encoders", "fused", "accelerometer")
     )
@@ -224,29 +224,33 @@ def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
 @pytest.mark.slow
 def test_check_finds_a_violation_of_each_limit(slave, short):
     """Each limit in turn is a little below its use by the same motion."""
-    uses = {use.limit: use.share for use in short.uses}
+    uses = {use.limit_name: use.used_share for use in short.uses}
     limits = slave.limits
     # Without this clearance all pairs could be beyond the search distance.
     wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
     distance = (
         0.2
         / next(
-            use for use in check_trajectory(wide, short.trajectory) if use.limit == "clearance"
-        ).share
+            use for use in check_trajectory(wide, short.trajectory) if use.limit_name == "clearance"
+        ).used_share
     )
     less = {
         "position": {"q_half": 0.99 * uses["position"] * limits.q_half},
         "velocity": {"velocity": 0.99 * uses["velocity"] * limits.velocity},
         "acceleration": {"acceleration": 0.99 * uses["acceleration"] * limits.acceleration},
-        "torque": {"effort": 0.99 * uses["torque"] * limits.effort},
-        "sensor": {"sensor": 0.99 * uses["sensor"] * limits.sensor},
+        "torque": {"max_torques": 0.99 * uses["torque"] * limits.max_torques},
+        "sensor": {"max_sensor_norms": 0.99 * uses["sensor"] * limits.max_sensor_norms},
         "workspace": {"box_half": 0.99 * uses["workspace"] * limits.box_half},
         "clearance": {"clearance": 1.01 * distance},
     }
     for name, changes in less.items():
         tight = dataclasses.replace(slave, limits=limits._replace(**changes))
         worst = check_trajectory(tight, short.trajectory)[0]
-        assert (worst.limit, worst.share > 1, worst.share < 1.03) == (name, True, True)
+        assert (worst.limit_name, worst.used_share > 1, worst.used_share < 1.03) == (
+            name,
+            True,
+            True,
+        )
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -256,8 +260,8 @@ def test_check_finds_both_sides_of_the_box(slave, axis, side):
     aside = limits.box_middle + 5 * side * limits.box_half * np.eye(3)[axis]
     moved = dataclasses.replace(slave, limits=limits._replace(box_middle=aside))
     uses = check_motion(moved, np.zeros(1), still, still, still)
-    use = next(use for use in uses if use.limit == "workspace")
-    assert use.share > 2 and use.what == "xyz"[axis]
+    use = next(use for use in uses if use.limit_name == "workspace")
+    assert use.used_share > 2 and use.where == "xyz"[axis]
 
 
 @pytest.mark.slow
@@ -268,9 +272,9 @@ def test_check_finds_self_collision_and_table_contact(slave):
         ([0, -2.2, 0.3, 0, 0, 0], {"world"}),
     ):
         worst = check_trajectory(slave, FourierTrajectory(np.array(q, float), t, t, 1.0))
-        clearance = next(use for use in worst if use.limit == "clearance")
-        assert clearance.share > 1
-        assert bodies & set(clearance.what.split(" and "))
+        clearance = next(use for use in worst if use.limit_name == "clearance")
+        assert clearance.used_share > 1
+        assert bodies & set(clearance.where.split(" and "))
 
 
 def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
@@ -291,8 +295,8 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
     assert "l0 and l3" in named and "l0 and l6" not in named
     assert "l0 and l2" not in named  # they touch in all postures
     still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
-    assert all(use.share < 1 for use in check_trajectory(found, still))
-    assert len(found.limits.pairs) > 0  # other pairs
+    assert all(use.used_share < 1 for use in check_trajectory(found, still))
+    assert len(found.limits.capsule_pairs) > 0  # other pairs
 
 
 @pytest.mark.slow
@@ -300,7 +304,7 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
 def test_environment_of_the_scenario_is_avoided(name):
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
-    assert all(use.share <= 1 for use in found.uses)
+    assert all(use.used_share <= 1 for use in found.uses)
     context = robot.diagram.CreateDefaultContext()
     of_plant = robot.plant.GetMyMutableContextFromRoot(context)
     of_scene = robot.scene_graph.GetMyContextFromRoot(context)
@@ -362,16 +366,18 @@ def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
     assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path" in words
     # 80 % of the model's limits; the load is gripper and finger plus 30 %.
-    np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
+    np.testing.assert_allclose(
+        robot.limits.max_torques, 0.8 * np.array([200, 200, 150, 30, 30, 15])
+    )
     np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
-    assert robot.limits.phi[0] == pytest.approx(1.3 * 0.9)
+    assert robot.limits.heaviest_phi[0] == pytest.approx(1.3 * 0.9)
     found = RobotFromModel(
         urdf, "l6", WristSensorConfig(), package_paths=(urdf.parent / "somewhere",),
         acceleration=(5.0,), payload=3.0,
     )  # fmt: skip
     assert "shapes are missing of l4: meshes" in "; ".join(found.assumptions)
     np.testing.assert_array_equal(found.limits.acceleration, np.full(6, 5.0))
-    assert found.limits.phi[0] == pytest.approx(3.0)
+    assert found.limits.heaviest_phi[0] == pytest.approx(3.0)
 
 
 def test_error_names_an_unreadable_mesh(urdf):
@@ -397,7 +403,7 @@ def test_links_that_always_touch_are_excluded(urdf):
     robot = RobotFromModel(urdf, "l6", WristSensorConfig(), package_paths=packages, payload=2.0)
     still = np.zeros((6, 2))
     uses = check_trajectory(robot, FourierTrajectory(robot.home, still, still, 1.0))
-    assert next(use for use in uses if use.limit == "clearance").share <= 1
+    assert next(use for use in uses if use.limit_name == "clearance").used_share <= 1
 
 
 @pytest.mark.parametrize(
@@ -549,7 +555,7 @@ def test_clearance_to_a_plane_is_checked(tmp_path):
         said = []
         uses = check_trajectory(robot, still, said.append)
         np.testing.assert_allclose(said, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0], rtol=1e-2)
-        share = next(use for use in uses if use.limit == "clearance").share
+        share = next(use for use in uses if use.limit_name == "clearance").used_share
         assert (share <= 1) == is_free
 
 
@@ -729,7 +735,7 @@ def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, m
     monkeypatch.setattr(excite_module, "minimise_criterion", lambda *_, **__: designs)
     small = excite(slave, period=2.4, harmonics=2, progress=False)
     np.testing.assert_array_equal(small.trajectory.q0, slave.home)
-    assert small.uses[0].share <= 1.0 and small.history.shape == (len(designs), 2)
+    assert small.uses[0].used_share <= 1.0 and small.history.shape == (len(designs), 2)
     assert np.isfinite(small.deviations[:10]).all()
 
 

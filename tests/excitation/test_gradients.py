@@ -17,16 +17,20 @@ from drake_teleop.lab.excitation.criteria import (
     characteristic_length,
 )
 from drake_teleop.lab.excitation.limits import (
-    CLEARANCE_SCALE_M,
     LIMIT_NAMES,
+    ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
     capsule_distances,
     empty_motions,
     write_limit_uses,
     write_link_motions,
 )
-from drake_teleop.lab.excitation.optimizer import Problem, Task, _DescentSearch
-from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
+from drake_teleop.lab.excitation.optimizer import DesignProblem, DesignTask, _DescentSearch
+from drake_teleop.lab.excitation.prediction import (
+    SensorNoise,
+    _motion_error_filter,
+    predicted_deviations,
+)
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_gains
@@ -108,7 +112,7 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
     for gains in fusion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _error_filter(gains, T)
+        numerator, denominator = _motion_error_filter(gains, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
@@ -134,13 +138,13 @@ def limits_of(arm) -> Limits:
         q_half=half,
         velocity=arm.velocity_limit,
         acceleration=arm.acceleration_limit,
-        effort=arm.effort_limit,
-        phi=arm.phi_load,
-        sensor=np.array([180.0, 10.0, 50.0, 500.0]),
+        max_torques=arm.effort_limit,
+        heaviest_phi=arm.phi_load,
+        max_sensor_norms=np.array([180.0, 10.0, 50.0, 500.0]),
         points_S=np.array([[0.0, 0.0, -0.085], [0.01, 0.02, 0.2]]),
         box_middle=np.array([0.65, 0.0, 0.7]),
         box_half=np.array([0.4, 0.7, np.inf]),
-        capsule_row=np.array([1, 5, -1]),
+        capsule_links=np.array([1, 5, -1]),
         capsule_ends=np.array(
             [
                 [[0.0, 0.0, -0.12], [0.45, 0.0, -0.12]],
@@ -149,8 +153,8 @@ def limits_of(arm) -> Limits:
             ]
         ),
         capsule_radius=np.array([0.08, 0.04, 0.05]),
-        pairs=np.array([[0, 1], [1, 2]]),
-        distances=np.array([0.02, -0.01]),
+        capsule_pairs=np.array([[0, 1], [1, 2]]),
+        min_pair_distances=np.array([0.02, -0.01]),
         clearance=0.02,
     )
 
@@ -169,8 +173,8 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     table[:-1, 23] = 0.5
     table[sliding, IS_PRISMATIC_COLUMN] = 1.0
     home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
-    task = Task(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
-    problem = Problem(task)
+    task = DesignTask(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
+    problem = DesignProblem(task)
     x = problem.candidate(np.random.default_rng(0), near_home=True)
     gradients = problem.evaluate(x, 3.0, 5.0).gradients
     scale = np.abs(gradients).max(axis=1)
@@ -194,7 +198,12 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     assert np.all(smooth >= largest)
     R_WS, p_WS = motions[:, -1, 12:].reshape(-1, 3, 3), motions[:, -1, 9:12]
     points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)
-    capsules = limits.capsule_row, limits.capsule_ends, limits.capsule_radius, limits.pairs
+    capsules = (
+        limits.capsule_links,
+        limits.capsule_ends,
+        limits.capsule_radius,
+        limits.capsule_pairs,
+    )
     distances = capsule_distances(motions, *capsules)
     found = dict(zip(LIMIT_NAMES, largest, strict=True))
     for name, expected in {
@@ -202,17 +211,19 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
         "velocity": np.abs(qd) / limits.velocity,
         "acceleration": np.abs(qdd) / limits.acceleration,
         "workspace": np.abs(points - limits.box_middle) / limits.box_half,
-        "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE_M,
+        "clearance": 1.0 - (distances - limits.min_pair_distances) / ZERO_USE_CLEARANCE_MARGIN_M,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
     # A use of 1 is the minimum distance.
-    assert (found["clearance"] > 1.0) == (distances < limits.distances).any()
+    assert (found["clearance"] > 1.0) == (distances < limits.min_pair_distances).any()
 
 
 def test_candidates_cover_the_middle_of_the_range(arm):
     limits, rng = limits_of(arm), np.random.default_rng(1)
     home = np.zeros(6)
-    problem = Problem(Task(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3))
+    problem = DesignProblem(
+        DesignTask(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3)
+    )
     starts = np.array([problem.candidate(rng, near_home=False)[:6] for _ in range(50)])
     share = np.abs(starts - limits.q_middle) / limits.q_half
     assert np.all(share <= 0.6) and np.all(share.max(axis=0) > 0.5)
@@ -225,9 +236,9 @@ def test_candidate_size_grows_with_the_square_of_the_period(arm):
     limits = limits_of(arm)._replace(q_half=wide, velocity=wide, acceleration=np.ones(6))
     coefficients = []
     for period in (3.0, 6.0):
-        task = Task(arm.table, limits, Criterion("kappa_w10", SCALES), np.zeros(6), period, 3)
+        task = DesignTask(arm.table, limits, Criterion("kappa_w10", SCALES), np.zeros(6), period, 3)
         rng = np.random.default_rng(2)
-        coefficients.append(Problem(task).candidate(rng, near_home=True)[6:])
+        coefficients.append(DesignProblem(task).candidate(rng, near_home=True)[6:])
     np.testing.assert_allclose(coefficients[1], 4.0 * coefficients[0], rtol=1e-12)
 
 
@@ -249,7 +260,7 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
     values = iter([3.0, 2.0, 2.5, 1.5])
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.zeros(1),
-        evaluate=lambda x, *sharpness: SimpleNamespace(largest_use=0.5),
+        evaluate=lambda x, *sharpness: SimpleNamespace(largest_limit_use=0.5),
         value=lambda: next(values),
         trajectory=lambda x: int(x[0]),
     )
@@ -257,7 +268,9 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
     search.start = 7
     for k in range(4):
         search._evaluate_once(np.array([float(k)]), 3.0, 5.0)
-    noted = [(x.evaluations, x.start, x.value, x.trajectory) for x in search.found]
+    noted = [
+        (x.num_evaluations, x.start_index, x.criterion_value, x.trajectory) for x in search.found
+    ]
     assert noted == [(1, 7, 3.0, 0), (2, 7, 2.0, 1), (4, 7, 1.5, 3)]
 
 

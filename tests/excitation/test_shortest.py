@@ -9,11 +9,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation import shortest as module
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import sensor_motion
-from drake_teleop.lab.excitation.optimizer import Task
+from drake_teleop.lab.excitation.optimizer import DesignTask
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import (
-    ShortestProblem,
+    ShortestMotionProblem,
     design_shortest_motion,
     sidak_factor,
 )
@@ -32,11 +32,11 @@ def slave() -> Robot:
     return RobotFromScenario(LoadScenario("identification"))
 
 
-def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
+def problem_of(slave: Robot, times: float = 1.0) -> ShortestMotionProblem:
     criterion = Criterion("A16", slave.scales)
-    task = Task(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
-    return ShortestProblem(
-        task, times * derivatives_over_tolerances(ASKED, slave.limits.phi), slave, None
+    task = DesignTask(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
+    return ShortestMotionProblem(
+        task, times * derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi), slave, None
     )
 
 
@@ -72,27 +72,30 @@ def test_tolerance_use_follows_from_white_noise_over_the_period(slave: Robot) ->
 def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
+    monkeypatch.setattr(module, "_MAX_ROUNDS_WITHOUT_PROGRESS", 0)
     found = design_shortest_motion(
         slave, parse_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
     )
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
-    assert 0.3 < found.reached.max() <= 1.0
-    assert all(use.share <= 1.0 for use in found.excitation.uses)
+    assert 0.3 < found.errors_over_tolerances.max() <= 1.0
+    assert all(use.used_share <= 1.0 for use in found.excitation.uses)
 
 
 def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
     """Without the accelerometer's noise the factor would be 2 to 5."""
-    problem, errors = problem_of(slave), derivatives_over_tolerances(ASKED, slave.limits.phi)
+    problem, errors = (
+        problem_of(slave),
+        derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi),
+    )
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)
     motion = sensor_motion(slave, problem.trajectory(x))
-    covariance = predicted_covariance(*motion, 1e-3, slave.noise, slave.limits.phi)
+    covariance = predicted_covariance(*motion, 1e-3, slave.noise, slave.limits.heaviest_phi)
     known = problem.deviations(motion, 1.2)
     np.testing.assert_allclose(known, deviations_over_tolerances(errors, covariance), rtol=0.03)
 
 
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
+    monkeypatch.setattr(module, "_MAX_ROUNDS_WITHOUT_MOTION", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
         design_shortest_motion(slave, parse_tolerance("inertia 0.00001 %"), starts=1)

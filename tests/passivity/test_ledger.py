@@ -123,7 +123,11 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
 
 @pytest.mark.parametrize(("servo", "damping"), [(0.8, 1.2), (1.2, 1.2), (1.2, 0.8)])
 def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
-    imperfect = {"believed_stiffness": servo, "believed_damping": damping, "motor_lag": 3e-3}
+    imperfect = {
+        "configured_stiffness_ratio": servo,
+        "configured_damping_ratio": damping,
+        "motor_lag": 3e-3,
+    }
     for seed in (1, 9):
         assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least_energy_sum(ACTUAL) >= -1e-6
 
@@ -188,13 +192,17 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     """
     rng, t = np.random.default_rng(seed), times(8.0)
     grip = rng.uniform(0.1, 0.4), 8.0, rng.uniform(200.0, 600.0)
-    imperfect = {"believed_stiffness": 1.2, "believed_damping": 1.2, "believed_mass": 1.2}
+    imperfect = {
+        "configured_stiffness_ratio": 1.2,
+        "configured_damping_ratio": 1.2,
+        "configured_mass_ratio": 1.2,
+    }
     run = run_one_dof(
         model(grip, 28.6e3, motor_lag=3e-3, **imperfect), CHARGED_BEFORE,
         NetworkConfig(delay=0.063, jitter=0.44, loss=0.44, burst=0.26), seed=seed, timeout=0.1,
         intent=charging(t, 2.0, rng.uniform(0.03, 0.06)),
     )  # fmt: skip
-    assert run.silent.max() > 0.2 and run.wall.min() < -100.0
+    assert run.time_without_packets.max() > 0.2 and run.wall.min() < -100.0
     assert run.least_energy_sum(ACTUAL) >= -1e-6
 
 
@@ -209,7 +217,14 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
 )
 def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     """Without initial energy and without information about the hand."""
-    task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
+    task = Task(
+        press_start=3.5,
+        press_end=4.5,
+        release_start=9.0,
+        release_end=10.0,
+        end=12.5,
+        rest_window=1.0,
+    )
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
     pressing = operator_intent(task)
     axis = model(grip, wall)
@@ -255,7 +270,7 @@ def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
         intent=charging(times(9.0), 3.2, 0.02),
     )  # fmt: skip
     rest = run.t > 6.5
-    assert 0.045 < run.silent[rest].max() < 0.05
+    assert 0.045 < run.time_without_packets[rest].max() < 0.05
     assert np.ptp(run.slave[rest]) < 2e-5 and np.ptp(run.felt[rest]) < 0.01
 
 

@@ -271,7 +271,7 @@ def test_unknown_method_is_rejected():
 @pytest.mark.slow
 @pytest.mark.parametrize(("wall", "round_trip"), [(5100.0, 1.0), (20000.0, 0.3), (20000.0, 0.02)])
 def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, round_trip):
-    model, task = OneDof(wall_stiffness=wall), Task(release=15.5, released=16.5, end=21.0)
+    model, task = OneDof(wall_stiffness=wall), Task(release_start=15.5, release_end=16.5, end=21.0)
     network = NetworkConfig(delay=round_trip / 2, jitter=0.25, loss=0.1)
 
     def found(method):

@@ -178,7 +178,9 @@ def test_force_limit_bounds_the_rendered_force():
 
 def test_four_channels_are_transparent_without_delay():
     """Rendered and contact force are equal, positions too, although the servo yields."""
-    task = Task(press=0.5, pressed=1.5, release=4.0, released=5.0, end=6.0, judged=1.0)
+    task = Task(
+        press_start=0.5, press_end=1.5, release_start=4.0, release_end=5.0, end=6.0, rest_window=1.0
+    )
     found = run_one_dof(
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
         intent=operator_intent(task), timeout=1.0,

@@ -172,7 +172,7 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method)
         result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
-        silent, steps = result.silent[:, 0] > TIMEOUT, np.arange(len(result.t))
+        silent, steps = result.time_without_packets[:, 0] > TIMEOUT, np.arange(len(result.t))
         since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
         resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from drake_teleop.lab.reproduction.report import (
     Comparison,
-    ReportFigure,
     compare_with_paper,
     describe_unaccepted,
     figure_captions,
@@ -48,7 +47,7 @@ def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
         path,
         setup=setup or {"Seed": "7"},
         summary=summary,
-        figures=[ReportFigure("Fig. 6", picture, figure_captions(summary)["fig6"])],
+        figures=[("Fig. 6", picture, figure_captions(summary)["fig6"])],
         parameters=parameter_rows(TRUE, TRUE + 0.01, STD),
         replay=replay,
     )
@@ -57,21 +56,21 @@ def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
 
 def test_only_found_and_reported_values_agree():
     rows = compare_with_paper(SUMMARY)
-    verdicts = {row.what: row.verdict for row in rows}
+    verdicts = {row.quantity: row.verdict for row in rows}
     assert set(verdicts.values()) == {"agrees", "as set", "within our bound", "for the record"}
-    assert [row.what for row in rows if row.verdict == "agrees"] == [
+    assert [row.quantity for row in rows if row.verdict == "agrees"] == [
         "Fig. 6: largest force left, σ = 0",
         "Fig. 8: found in the contact force after",
         "Fig. 8: a threshold on the raw force finds it",
         "Fig. 8: false alarm at about 600 ms",
         "Fig. 8: contact peak over inertial peak",
     ]
-    assert {row.origin for row in rows if row.verdict == "agrees"} == {"found"}
-    assert {row.origin for row in rows if row.verdict == "as set"} == {"set"}
-    bounded = {row.paper for row in rows if row.verdict == "within our bound"}
+    assert {row.set_or_found for row in rows if row.verdict == "agrees"} == {"found"}
+    assert {row.set_or_found for row in rows if row.verdict == "as set"} == {"set"}
+    bounded = {row.paper_value for row in rows if row.verdict == "within our bound"}
     assert bounded == {"not reported"}
-    assert rows[0].ours == "99.4 N"
-    assert rows[0].accepted == "90 to 115 N"
+    assert rows[0].reproduced_value == "99.4 N"
+    assert rows[0].accepted_range == "90 to 115 N"
 
 
 def test_unreported_values_never_agree():
@@ -100,7 +99,7 @@ def test_unreported_values_never_agree():
 def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdict, tmp_path):
     wrong = SUMMARY | {name: value}
     (row,) = (row for row in compare_with_paper(wrong) if row.css_class == "differs")
-    assert what in row.what
+    assert what in row.quantity
     assert row.verdict == verdict
     page = write(tmp_path / "report.html", wrong)
     assert page.count('class="pill differs"') == 1
@@ -109,7 +108,7 @@ def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdic
         part, _, short = full.partition(".")
         nested.setdefault(part, {})[short] = number
     (line,) = describe_unaccepted(nested)
-    assert line.startswith(row.what) and line.endswith(verdict)
+    assert line.startswith(row.quantity) and line.endswith(verdict)
 
 
 def test_captions_contain_values_of_the_run():

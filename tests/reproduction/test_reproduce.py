@@ -22,7 +22,7 @@ from drake_teleop.lab.reproduction.experiments import (
     contact_values,
     free_values,
     ideal_values,
-    raw_force_excess,
+    raw_force_beyond_free_range,
     simulate_free_motion,
 )
 from drake_teleop.lab.reproduction.report import (
@@ -220,14 +220,14 @@ def motion() -> ContactMotion:
     )
     return ContactMotion(
         scenario=LoadScenario("contact_transition"),
-        touched=result,
-        free=result,
-        raw=free + touch + residual,
-        calculated=touch + residual,
-        raw_free=free + residual,
-        calculated_free=residual,
-        contact=is_in_contact(result),
-        threshold=0.75,
+        contact_result=result,
+        free_result=result,
+        measured_wrench=free + touch + residual,
+        calculated_wrench=touch + residual,
+        measured_wrench_free=free + residual,
+        calculated_wrench_free=residual,
+        in_contact=is_in_contact(result),
+        threshold_N=0.75,
     )
 
 
@@ -235,47 +235,53 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
     figures = contact_values(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
-    assert np.all(raw_force_excess(motion) <= 0)
+    assert np.all(raw_force_beyond_free_range(motion) <= 0)
     assert figures["false_alarm_0_6_s"] is False
     assert figures["duration_s"] == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_raw_force_detects_contact_by_any_axis(motion, axis):
-    told = motion.raw.copy()
-    told[motion.contact, axis] += 180.0
-    figures = contact_values(dataclasses.replace(motion, raw=told))
+    told = motion.measured_wrench.copy()
+    told[motion.in_contact, axis] += 180.0
+    figures = contact_values(dataclasses.replace(motion, measured_wrench=told))
     assert figures["raw_detectable"] is True
 
 
 def test_raw_force_detects_contact_by_its_norm(motion):
     """Each component is inside its range, but not the norm."""
-    free, told = motion.raw_free.copy(), motion.raw.copy()
+    free, told = motion.measured_wrench_free.copy(), motion.measured_wrench.copy()
     free[:100, 0] = told[:100, 0] = 80.0
-    told[motion.contact, 0] = 80.0
-    excess = raw_force_excess(dataclasses.replace(motion, raw=told, raw_free=free))
+    told[motion.in_contact, 0] = 80.0
+    excess = raw_force_beyond_free_range(
+        dataclasses.replace(motion, measured_wrench=told, measured_wrench_free=free)
+    )
     assert np.all(excess[:3] <= 0)
     assert excess[3] > 0
 
 
 def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
-    calculated = motion.calculated.copy()
-    calculated[np.argmin(np.abs(motion.touched.t - 0.6)), 2] = 2.0
-    figures = contact_values(dataclasses.replace(motion, calculated=calculated))
+    calculated = motion.calculated_wrench.copy()
+    calculated[np.argmin(np.abs(motion.contact_result.t - 0.6)), 2] = 2.0
+    figures = contact_values(dataclasses.replace(motion, calculated_wrench=calculated))
     assert figures["false_alarm_0_6_s"] is True
 
 
 def test_contact_is_not_detected_without_elimination(motion):
-    largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
-    figures = contact_values(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
+    largest = 1.5 * np.abs(motion.measured_wrench_free[:, 2]).max()
+    figures = contact_values(
+        dataclasses.replace(motion, calculated_wrench=motion.measured_wrench, threshold_N=largest)
+    )
     assert figures["detected_s"] is None
     assert np.isnan(values_by_full_name({"contact": figures})["contact.detected_s"])
 
 
 def test_contact_time_is_null_without_contact(motion):
-    nothing = np.zeros(len(motion.touched.t), dtype=bool)
+    nothing = np.zeros(len(motion.contact_result.t), dtype=bool)
     figures = contact_values(
-        dataclasses.replace(motion, contact=nothing, calculated=motion.calculated_free)
+        dataclasses.replace(
+            motion, in_contact=nothing, calculated_wrench=motion.calculated_wrench_free
+        )
     )
     assert figures["true_s"] is figures["detected_s"] is None
     assert figures["raw_detectable"] is False
@@ -321,7 +327,7 @@ def ideal_run(run, results):
 
 def ideal_rows(values):
     rows = compare_with_paper(defaultdict(lambda: 0.5, values_by_full_name({"ideal": values})))
-    return [row.holds for row in rows if row.what.startswith("All axes")]
+    return [row.is_accepted for row in rows if row.quantity.startswith("All axes")]
 
 
 def test_elimination_removes_the_reaction_force_of_the_plant(ideal_run):
@@ -334,8 +340,10 @@ def test_elimination_removes_the_reaction_force_of_the_plant(ideal_run):
 def test_ideal_run_rejects_each_wrong_sign_of_the_regressor(ideal_run, monkeypatch):
     """Wrong signs in the regressor, and in the elimination's own function."""
     sparse = slice(None, None, 20)
-    motion = tuple(part[sparse] for part in ideal_run.motion)
-    run = dataclasses.replace(ideal_run, reaction=ideal_run.reaction[sparse], motion=motion)
+    motion = tuple(part[sparse] for part in ideal_run.sensor_motion)
+    run = dataclasses.replace(
+        ideal_run, weld_reaction=ideal_run.weld_reaction[sparse], sensor_motion=motion
+    )
     mutants = mutants_of_regressor()
     assert len(mutants) == 54
     for place, into in mutants.items():
@@ -370,7 +378,7 @@ def test_wrong_mass_increases_the_residual():
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
     motion = simulate_free_motion(scenario, estimate, lambda done: None)
-    assert tuple(motion.scaled) == SIGMAS
+    assert tuple(motion.scaled_wrenches) == SIGMAS
     figures = free_values(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

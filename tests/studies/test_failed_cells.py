@@ -16,10 +16,10 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     Factorial,
     effects_table,
-    fill_missing,
+    fill_missing_values,
     main_effects,
+    means_and_half_widths_over_seeds,
     pair_means,
-    seed_interval,
 )
 from drake_teleop.lab.studies.level_model import (
     NO_RUN,
@@ -68,26 +68,26 @@ def test_cell_without_successful_run_has_no_value():
         [np.nan if fails(s, g) else effort(s, g) + 0.9 for g in GAMMAS] for s in SIGMAS
     ]  # the mean of seeds 0, 2, 4, 6 is 3
     np.testing.assert_allclose(pair.mean, expected)
-    assert set(pair.why[np.isnan(pair.mean)]) == {NO_SUCCESS}
-    assert set(pair.why[np.isfinite(pair.mean)]) == {""}
+    assert set(pair.missing_reasons[np.isnan(pair.mean)]) == {NO_SUCCESS}
+    assert set(pair.missing_reasons[np.isfinite(pair.mean)]) == {""}
 
 
 def test_effects_compare_equal_combinations_only():
     found = main_effects(TOUCH, rows_of(TOUCH, noise=0.1), EFFORT)
     sigma, gamma = found["force_scaling.sigma"], found["force_scaling.gamma"]
     # All sigmas have gamma 0.25 and 1; sigma 1 has all successful gammas.
-    assert (sigma.compared, sigma.left_out) == (2, 3)
-    assert (gamma.compared, gamma.left_out) == (1, 3)
+    assert (sigma.num_used_combinations, sigma.num_unused_combinations) == (2, 3)
+    assert (gamma.num_used_combinations, gamma.num_unused_combinations) == (1, 3)
     truth = np.array([np.mean([effort(s, g) for g in GAMMAS[:2]]) for s in SIGMAS])
-    assert np.all(np.abs(sigma.effect - truth + truth.mean()) <= sigma.effect_half)
-    assert np.all(np.abs(sigma.mean - truth - 0.9) <= sigma.half)
+    assert np.all(np.abs(sigma.effect - truth + truth.mean()) <= sigma.effect_half_width)
+    assert np.all(np.abs(sigma.mean - truth - 0.9) <= sigma.half_width)
     truth = np.array([effort(1.0, g) for g in GAMMAS[:4]])
-    assert np.all(np.abs(gamma.effect[:4] - truth + truth.mean()) <= gamma.effect_half[:4])
-    assert np.all(gamma.effect_half[:4] < 1.0)
-    assert gamma.why == ["", "", "", "", NO_SUCCESS]
-    for figures in (gamma.mean, gamma.half, gamma.effect, gamma.effect_half):
+    assert np.all(np.abs(gamma.effect[:4] - truth + truth.mean()) <= gamma.effect_half_width[:4])
+    assert np.all(gamma.effect_half_width[:4] < 1.0)
+    assert gamma.missing_reasons == ["", "", "", "", NO_SUCCESS]
+    for figures in (gamma.mean, gamma.half_width, gamma.effect, gamma.effect_half_width):
         assert np.isnan(figures[4])
-    assert not gamma.fitted
+    assert not gamma.is_fitted
 
 
 def test_effects_table_lists_excluded_combinations():
@@ -134,8 +134,12 @@ def test_levels_that_never_meet_are_not_compared():
         pl.when((pl.col("a.x") > 0.5) == (pl.col("a.y") > 0.5)).then(1.0).alias(EFFORT)
     )
     found = main_effects(study, rows, EFFORT)["a.x"]
-    assert np.isnan(found.effect).all() and found.compared == 0 and found.left_out == 3
-    assert found.why == [NOT_COMPARABLE] * 2
+    assert (
+        np.isnan(found.effect).all()
+        and found.num_used_combinations == 0
+        and found.num_unused_combinations == 3
+    )
+    assert found.missing_reasons == [NOT_COMPARABLE] * 2
 
 
 def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
@@ -146,7 +150,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
     seen[:2, 1:] = False
     for _ in range(40):
         table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
-        table = fill_missing(np.where(seen, table, np.nan))
+        table = fill_missing_values(np.where(seen, table, np.nan))
         for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
             found, halves = Factorial(levels, [3, 2], which).effects(table)
             into.append(np.abs(found[0]) <= halves[0])
@@ -159,7 +163,7 @@ def test_half_widths_equal_least_squares():
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
-    table = fill_missing(np.where(seen, random.normal(size=(6, 4)), np.nan))
+    table = fill_missing_values(np.where(seen, random.normal(size=(6, 4)), np.nan))
     design = Factorial(levels, [3, 2], seen)
     weights = design.comparable_levels(0)[2]
     weights -= weights.mean(axis=0)
@@ -171,7 +175,10 @@ def test_half_widths_equal_least_squares():
     runs = seen.sum(axis=1)
     spread = np.sum((weights @ solve[:6]) ** 2, axis=1) - weights**2 @ ((runs - 1) / 12)
     expected = stdtrit(freedom, 0.975) ** 2 * variance * spread
-    found = design.means(table, weights)[1] ** 2 - seed_interval(weights @ table)[1] ** 2
+    found = (
+        design.means(table, weights)[1] ** 2
+        - means_and_half_widths_over_seeds(weights @ table)[1] ** 2
+    )
     assert spread.min() > 0
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -212,13 +219,15 @@ def test_cell_without_point_is_empty_but_does_not_exclude_levels():
     there = np.histogram2d(*points.T, bins=5, range=[[0, 1], [0, 1]])[0] > 0
     assert 6 < (~there).sum() < 15
     assert np.array_equal(np.isfinite(pair.mean), there)
-    assert set(pair.why[~there]) == {NO_RUN}
-    assert all(found.left_out == 0 for found in main_effects(study, rows, EFFORT).values())
+    assert set(pair.missing_reasons[~there]) == {NO_RUN}
+    assert all(
+        found.num_unused_combinations == 0 for found in main_effects(study, rows, EFFORT).values()
+    )
 
 
 def test_adaptive_design_has_no_value_in_unsearched_cells():
     study, rows = looked("adaptive")
     for found in main_effects(study, rows, EFFORT).values():
-        assert found.left_out > 0
+        assert found.num_unused_combinations > 0
         shown = np.isfinite(found.effect)
         np.testing.assert_allclose(np.diff(found.mean[shown]), 0.2 * np.diff(np.flatnonzero(shown)))

@@ -88,12 +88,14 @@ def test_irrelevant_factor_has_no_significant_effect():
     plain = rows.group_by("a.w").agg(pl.col("hand_work_J").mean())["hand_work_J"].to_numpy()
     found = main_effects(study, rows, "hand_work_J")
     word = found["a.w"]
-    assert word.names == ["ideal", "real", "other"]
+    assert word.level_names == ["ideal", "real", "other"]
     assert np.ptp(plain) > 2.0
     assert np.ptp(word.effect) < 0.1
-    assert np.all(np.abs(word.effect - np.array([-0.02, 0.04, -0.02]) / 3) <= word.effect_half)
+    assert np.all(
+        np.abs(word.effect - np.array([-0.02, 0.04, -0.02]) / 3) <= word.effect_half_width
+    )
     # The effects of the others are visible; x is strongest at its ends.
-    assert np.all(np.abs(found["a.x"].effect) > found["a.x"].effect_half)
+    assert np.all(np.abs(found["a.x"].effect) > found["a.x"].effect_half_width)
 
 
 def test_intervals_contain_seed_dependent_effects():
@@ -101,16 +103,16 @@ def test_intervals_contain_seed_dependent_effects():
     alike = main_effects(study, made_up(study, force), "hand_work_J")
     rows = made_up(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
     apart = main_effects(study, rows, "hand_work_J")
-    assert apart["a.x"].effect_half[0] > 5 * alike["a.x"].effect_half[0]
-    assert apart["a.y"].effect_half[0] < 1.5 * alike["a.y"].effect_half[0]
+    assert apart["a.x"].effect_half_width[0] > 5 * alike["a.x"].effect_half_width[0]
+    assert apart["a.y"].effect_half_width[0] < 1.5 * alike["a.y"].effect_half_width[0]
 
 
 def test_exact_fit_has_a_width_of_rounding():
     study = sobol(64)
     found = main_effects(study, made_up(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
     for name, truth in (("a.x", 3 * np.array([-0.4, -0.2, 0, 0.2, 0.4])), ("a.y", np.zeros(5))):
-        assert np.all(np.abs(found[name].effect - truth) <= found[name].effect_half)
-        assert np.all(found[name].effect_half < 1e-8)
+        assert np.all(np.abs(found[name].effect - truth) <= found[name].effect_half_width)
+        assert np.all(found[name].effect_half_width < 1e-8)
 
 
 def test_failed_point_does_not_change_other_effects():

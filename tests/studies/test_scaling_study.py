@@ -13,7 +13,7 @@ from drake_teleop.common.files import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
     CRITERIA_SETS,
-    TASKS,
+    TASK_CRITERIA,
     draw_best_scales,
     rate_scales,
 )
@@ -38,7 +38,7 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
             for name in criteria
         }
         | {"success": np.ones((5, 6, seeds))}
-        for task, criteria in TASKS.items()
+        for task, criteria in TASK_CRITERIA.items()
     }
 
 
@@ -48,12 +48,12 @@ def test_best_point_of_each_selection():
         found = rate_scales(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
         assert place[1] == 5 if best is None else place == best
-        assert np.all((found.low <= found.merit) & (found.merit <= found.high))
+        assert np.all((found.merit_low <= found.merit) & (found.merit <= found.merit_high))
         assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
-        assert found.best.sum() == pytest.approx(1.0)
-    assert rate_scales(tables(), ("effort",)).best[0, 0] > 0.95
+        assert found.best_share.sum() == pytest.approx(1.0)
+    assert rate_scales(tables(), ("effort",)).best_share[0, 0] > 0.95
     # Without dependence on sigma the choice must be uncertain.
-    assert rate_scales(tables(), ("force",)).best.max() < 0.95
+    assert rate_scales(tables(), ("force",)).best_share.max() < 0.95
 
 
 def test_points_with_many_failures_are_excluded():
@@ -62,7 +62,7 @@ def test_points_with_many_failures_are_excluded():
     failing["press"]["effort"][0, 0, :2] = np.nan
     found = rate_scales(failing, ("effort",))
     assert np.isnan(found.merit[0, 0])
-    assert found.best[0, 0] == 0.0
+    assert found.best_share[0, 0] == 0.0
 
 
 @pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
@@ -71,8 +71,8 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
     rows["press"]["success"][4, 2, :failing] = 0.0
     rows["press"]["effort"][4, 2, :failing] = np.nan
     found = rate_scales(rows, ("effort",))
-    assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 29 * best
-    assert found.best.sum() == pytest.approx(best)
+    assert np.isfinite(found.merit_low).sum() == np.isfinite(found.merit).sum() == 29 * best
+    assert found.best_share.sum() == pytest.approx(best)
 
 
 def test_choice_picture_has_one_scale_and_no_empty_cell():
@@ -93,7 +93,7 @@ def test_choice_picture_has_one_scale_and_no_empty_cell():
 
 
 def test_more_seeds_give_narrower_intervals():
-    widths = [np.mean(found.high - found.low) for found in (
+    widths = [np.mean(found.merit_high - found.merit_low) for found in (
         rate_scales(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
     )]  # fmt: skip
     assert widths[1] < 0.5 * widths[0]
@@ -108,7 +108,7 @@ def test_the_shipped_studies_load(name):
 
 def test_shipped_studies_share_their_scales():
     studies = {name: LoadStudy(name) for name in STUDIES}
-    assert sum(study.size() * study.repeats for study in studies.values()) >= 1000
+    assert sum(study.num_points() * study.repeats for study in studies.values()) >= 1000
     scales = [
         [f for f in studies[f"scaling_{task}"].factors if f.field.startswith("force_scaling.")]
         for task in ("touch", "press", "insert", "reach")

@@ -43,7 +43,7 @@ def run(out, study=STUDY, function=work, **options):
 @pytest.fixture(autouse=True)
 def parts_of_several_runs(monkeypatch):
     """As in a large study."""
-    monkeypatch.setattr(runs, "_NUM_CHUNKS", 20)
+    monkeypatch.setattr(runs, "_TARGET_NUM_CHUNKS", 20)
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ import json, os, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 import test_shards as shards
-shards.runs._NUM_CHUNKS = 20
+shards.runs._TARGET_NUM_CHUNKS = 20
 
 def run(number, last):
     left = [last]

@@ -25,7 +25,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.measures import default_measures, evaluate_measures
-from drake_teleop.lab.studies.runs import ONE_TIME_COST, StudyProgress, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, StudyProgress, run_study
 from drake_teleop.lab.studies.store import Store, open_store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.station.result import SimulationResult
@@ -56,7 +56,7 @@ import joblib, polars
 from drake_teleop.lab.studies import runs
 from drake_teleop.lab.studies.design import Factor, Study
 
-runs._NUM_CHUNKS = 150  # as many runs in a part as a larger study has
+runs._TARGET_NUM_CHUNKS = 150  # as many runs in a part as a larger study has
 
 def work(values, seed):
     time.sleep(pause)
@@ -227,7 +227,7 @@ def test_error_without_dask_names_the_extra(files, monkeypatch):
 
 @pytest.mark.slow
 def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
-    out, work, calls = files / "stopped", studies.StationWork.__call__, []
+    out, work, calls = files / "stopped", studies.StationRunFunction.__call__, []
 
     def stopping(self, values, seed):
         calls.append(seed)
@@ -235,7 +235,7 @@ def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
             raise KeyboardInterrupt
         return work(self, values, seed)
 
-    monkeypatch.setattr(studies.StationWork, "__call__", stopping)
+    monkeypatch.setattr(studies.StationRunFunction, "__call__", stopping)
     with pytest.raises(KeyboardInterrupt, match="keeps 5 of 12 runs"):
         study_command(files / "study.yaml", out, jobs=1, quiet=True)
     assert study_command(files / "study.yaml", out, jobs=1, quiet=True) == serial[0]
@@ -571,7 +571,7 @@ def test_measures_of_a_known_motion():
 
 
 def test_preset_as_factor_sets_its_values():
-    work = studies.StationWork({}, "x", (), 1.0)
+    work = studies.StationRunFunction({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
     assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
@@ -704,7 +704,7 @@ def test_remaining_time_follows_from_the_latest_runs():
     counter.start(lambda fraction, words="": shown.append((fraction, words)), 4)
     counter.add_earlier_runs(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
-    counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}] * 2)
+    counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}] * 2)
     assert shown[-1] == (0.22, "22/100, about 0:00:39 left")
     for _ in range(18):
         counter.add_finished_runs([{"seconds": 2.0}])
@@ -719,7 +719,7 @@ def test_repeated_identifications_count_in_the_remaining_time():
     counter = StudyProgress(100)
     counter.start(lambda fraction, words="": shown.append(words), 1)
     for _ in range(40):
-        counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}])
+        counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}])
     assert shown[0] == "1/100, about 0:03:18 left"
     assert shown[-1] == "40/100, about 0:09:00 left"
 

@@ -52,10 +52,10 @@ def test_intervals_have_their_coverage():
     for _ in range(2000):
         values = truth[levels] + np.repeat(noise.normal(0, 3.0, 5), 3) + noise.normal(0, 0.5, 15)
         found = estimate_means(values, levels, seeds, 3)
-        inside.append(np.abs(found.mean - truth) <= found.half)
+        inside.append(np.abs(found.mean - truth) <= found.half_width)
         effect = found.mean - found.mean.mean() - (truth - truth.mean())
-        effect_inside.append(np.abs(effect) <= found.effect_half)
-        widths.append(found.effect_half / found.half)
+        effect_inside.append(np.abs(effect) <= found.effect_half_width)
+        widths.append(found.effect_half_width / found.half_width)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert np.mean(effect_inside) == pytest.approx(0.95, abs=0.01)
     assert np.median(widths) < 0.3  # common shifts of a seed cancel
@@ -65,7 +65,7 @@ def test_nan_values_are_ignored():
     values, levels, seeds = np.array([1.0, np.nan, 3.0, 5.0]), np.zeros(4, int), np.arange(4.0)
     assert estimate_means(values, levels, seeds, 1).mean[0] == 3.0
     nothing = estimate_means(np.full(4, np.nan), levels, seeds, 1)
-    assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half[0])
+    assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half_width[0])
 
 
 def test_effects_equal_the_synthetic_ones():

@@ -19,7 +19,7 @@ from drake_teleop.lab.tuning.press_trial import (
     rms_above,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
-from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
+from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
@@ -29,7 +29,7 @@ GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, 
 
 
 def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
-    stated = stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
+    stated = make_stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
@@ -50,7 +50,7 @@ def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
 )
 def test_invalid_sets_are_refused(arguments, where):
     with pytest.raises(DrakeTeleopError, match=f"^{where}"):
-        stated_set(*arguments)
+        make_stated_set(*arguments)
 
 
 def test_unknown_networks_are_refused():
@@ -108,15 +108,17 @@ class FakeStation:
 def trial(walls=(0.5, 20.0)) -> StationTrial:
     given = LoadScenario("contact_transition")
     base = without_task_and_method(given, "internet")
-    return StationTrial(given, base, stated_set(["light", "firm"], walls, "press"), np.ones(16))
+    return StationTrial(
+        given, base, make_stated_set(["light", "firm"], walls, "press"), np.ones(16)
+    )
 
 
 def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
     found = search_settings(trial(), FakeStation(limit=np.inf, one_axis_limit=2.2))
     assert (found.settings.method, found.settings.sigma_inertia) == ("ledger", 0.0)
     assert found.settings.gamma == pytest.approx(2.2 / 1.1)
-    assert {row["wall"] for row in found.limits} == {20000.0, 24000.0, 40000.0}
-    assert all(row["gamma"] == found.settings.gamma for row in found.limits)
+    assert {row["wall"] for row in found.limit_runs} == {20000.0, 24000.0, 40000.0}
+    assert all(row["gamma"] == found.settings.gamma for row in found.limit_runs)
 
 
 def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin():
@@ -124,9 +126,9 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     station = FakeStation(limit=limit, one_axis_limit=2.2)
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
-    assert {row["gamma"] for row in found.inside} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.inside} == set(trial().stated.corners)
-    assert not all(meets_requirements(row) for row in found.limits)
+    assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
+    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(trial().stated.corners)
+    assert not all(meets_requirements(row) for row in found.limit_runs)
 
 
 def test_search_refuses_a_set_that_no_settings_hold():
@@ -136,7 +138,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 
 def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
-    stated = stated_set(["light", "firm"], [1.0], "press")
+    stated = make_stated_set(["light", "firm"], [1.0], "press")
     tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0

@@ -6,7 +6,7 @@ H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
-
-if TYPE_CHECKING:
-    pass
 
 RealArray = NDArray[np.float64]
 BooleanArray = NDArray[np.bool_]
@@ -118,9 +115,9 @@ class WorstLoads(NamedTuple):
     At w [rad/s], X > 0 is a mass X / w [kg], X < 0 a stiffness -X w [N/m].
     """
 
-    hand: RealArray
-    environment: RealArray
-    resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
+    hand_reactance: RealArray
+    environment_reactance: RealArray
+    loop_resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
 
 
 def worst_loads(H: Complex) -> WorstLoads:
@@ -196,7 +193,7 @@ def can_oscillate(
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
     dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
-    t, u = _edge_crossings(h11, h12 * h21, h22, z, dz, e, de)
+    t, u = _oscillation_points_on_edges(h11, h12 * h21, h22, z, dz, e, de)
     crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
     # No edges cross if one region contains the other.
     felt = transmitted_impedance(H, e[..., 0, 0])
@@ -212,12 +209,14 @@ def stiffness_limit(H: Complex, omega: RealArray, hand: ImpedanceRange) -> RealA
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
-    t, u = _edge_crossings(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
+    t, u = _oscillation_points_on_edges(
+        h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer
+    )
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
     return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
 
 
-def _edge_crossings(
+def _oscillation_points_on_edges(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
 ) -> tuple[RealArray, RealArray]:
     # Hand z + t dz and wall e + u de oscillate at t, u (nan: never), where
@@ -254,11 +253,14 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # offsets of the discs, in half diagonals
+_DISC_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, RealArray]:
     diagonal = corners[..., 2] - corners[..., 0]
-    right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS
+    right = (
+        diagonal.real[..., None] / 2
+        + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS_IN_HALF_DIAGONALS
+    )
     middle = corners[..., 0] + 0.5j * diagonal.imag
     return middle[..., None] + right, np.hypot(right, diagonal.imag[..., None] / 2)

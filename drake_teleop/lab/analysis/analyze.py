@@ -23,7 +23,7 @@ from drake_teleop.lab.analysis.linearization import (
     linearize,
 )
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.report import Curves, print_tables, write_report
+from drake_teleop.lab.analysis.report import ReportCurves, print_tables, write_report
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
 from drake_teleop.lab.analysis.verdict import verdict_sentences
@@ -63,7 +63,7 @@ def analyze_command(
 
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | StartStage = True
-) -> tuple[dict[str, Any], Curves]:
+) -> tuple[dict[str, Any], ReportCurves]:
     """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze_in_stages(scenario, direction, stage)
@@ -71,7 +71,7 @@ def analyze(
 
 def _analyze_in_stages(
     scenario: Scenario, direction: str, stage: StartStage
-) -> tuple[dict[str, Any], Curves]:
+) -> tuple[dict[str, Any], ReportCurves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
@@ -108,18 +108,20 @@ def _analyze_in_stages(
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
-        "wall_is": describe_wall(scenario, along.axis.wall_stiffness > 0.0),
+        "wall_is": describe_wall_source(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            figures.diagram_figures(name, close_all_loops(system, linear), one_axis, sampling)
+            figures.summarise_diagram_stability(
+                name, close_all_loops(system, linear), one_axis, sampling
+            )
             for name, system, one_axis in points
         ],
         "two_port": figures.two_port_deviations(with_hand, axis, sampling),
         "margins": figures.margin_rows(axis, sampling, wall[0]),
-        "absolute": figures.absolute_figures(H, axis),
-        "bounded": figures.bounded_figures(H, axis, sampling),
-        "transparency": figures.transparency_figures(H, axis, wall),
-        "z_width": figures.z_width_figures(axis, sampling),
+        "absolute": figures.absolute_stability_values(H, axis),
+        "bounded": figures.stiffest_stable_walls(H, axis, sampling),
+        "transparency": figures.transparency_values(H, axis, wall),
+        "z_width": figures.virtual_wall_limits(axis, sampling),
     }
     progress(1.0)
     maps = figures.parameter_maps(axis, wall, sampling, stage)
@@ -136,7 +138,7 @@ def _analyze_in_stages(
     summary["measured"] = None
     if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        summary["measured"] = figures.measured_figures(
+        summary["measured"] = figures.measure_free_impedance(
             linear, along, close_other_directions(free, linear, along)
         )
         measured(1.0)
@@ -146,10 +148,10 @@ def _analyze_in_stages(
     for grip in GRIP_IMPEDANCES:
         loop = cut_loop(figures.axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
-    return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
+    return summary, ReportCurves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
 
 
-def describe_wall(scenario: Scenario, is_known: bool) -> str:
+def describe_wall_source(scenario: Scenario, is_known: bool) -> str:
     """Return the source of the analysed wall stiffness as text."""
     if scenario.first_sheet_spring is not None:
         return "the leaf"

@@ -14,15 +14,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampling, cut_period_map
+from drake_teleop.lab.analysis.period_map import (
+    RECEIVED_FORCE,
+    SAMPLED_FORCE,
+    Array,
+    Sampling,
+    period_map_of_cut_loop,
+)
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
 _POLE_ANGLE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
-_GOLDEN_RATIO, _GOLDEN_STEPS = 0.6180339887498949, 25
+_GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_CROSSINGS = 32
 _MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
-_DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the growth rate, from 1/s
+_MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS = 12, 30  # from 1/s
+_NUM_NEWTON_STEPS = 12
 _UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
@@ -30,12 +37,13 @@ _UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as
 class CutLoop:
     """Transfer function L(z) of the loop cut at the displayed force, without the channel."""
 
-    open: Complex  #: (..., n) multipliers of the cut loop
-    closed: Complex  #: (..., n) multipliers of the loop closed without delay
-    period: Array  #: period of the hand [s], (...)
-    angles: Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    phases: Array  #: unwrapped phases of L at these angles
-    signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
+    open_multipliers: Complex  #: (..., n) multipliers of the cut loop
+    closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
+    period_s: Array  #: period of the hand [s], (...)
+    #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
+    crossing_angles: Array
+    crossing_phases: Array  #: unwrapped phases of L at these angles
+    crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
     def from_multipliers(
@@ -44,7 +52,7 @@ class CutLoop:
         """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
         shape, n = opened.shape[:-1], opened.shape[-1]
         found = np.zeros((3, *shape, _MAX_CROSSINGS))
-        _find_crossings(
+        _write_gain_crossings(
             opened.reshape(-1, n),
             closed.reshape(-1, n),
             np.full(shape, level).ravel(),
@@ -55,11 +63,14 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force; raise as `cut_period_map`."""
-    M = cut_period_map(axis, sampling)
+    """Return the loop without delay, cut at the displayed force.
+
+    Raise the errors of `period_map_of_cut_loop`.
+    """
+    M = period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
-    closed[..., :, SAMPLE] += M[..., :n, n + 3 + RECEIVED]
+    closed[..., :, SAMPLED_FORCE] += M[..., :n, n + 3 + RECEIVED_FORCE]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
     return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))
@@ -67,11 +78,11 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
     """Return the response (N, ...) at `frequency` [rad/s], `delay` one way [s]; limit: 1."""
-    dimensions = max(loop.period.ndim, np.ndim(delay))
+    dimensions = max(loop.period_s.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
-    z = np.exp(1j * w * loop.period)[..., None]
+    z = np.exp(1j * w * loop.period_s)[..., None]
     # Factor by factor, to keep precision for poles close to z = 1.
-    L = 1 - np.prod((z - loop.closed) / (z - loop.open), axis=-1)
+    L = 1 - np.prod((z - loop.closed_multipliers) / (z - loop.open_multipliers), axis=-1)
     return L * np.exp(-2j * w * np.asarray(delay))
 
 
@@ -80,51 +91,56 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < _MIN_LOOP_GAIN:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(_interpolate(np.unwrap(angle), _find_zero_crossings(log_gain)), 2 * np.pi)
+    lag = np.mod(_interpolate_steps(np.unwrap(angle), _crossing_fractions(log_gain)), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    factor = np.exp(-_interpolate(log_gain, np.where(is_jump, np.nan, _find_zero_crossings(angle))))
+    fraction = np.where(is_jump, np.nan, _crossing_fractions(angle))
+    factor = np.exp(-_interpolate_steps(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _find_zero_crossings(value: Array) -> Array:
+def _crossing_fractions(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _interpolate(value: Array, fraction: Array) -> Array:
+def _interpolate_steps(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
-    D = (2 * np.asarray(delay) / loop.period)[..., None]
-    turns = (loop.phases - D * loop.angles) / (2 * np.pi)
+    D = (2 * np.asarray(delay) / loop.period_s)[..., None]
+    angles = loop.crossing_angles
+    turns = (loop.crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
-    around = np.where(loop.angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
-    return outside - (loop.signs * around).sum(axis=-1).astype(np.int64)
+    around = np.where(angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
+    outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
+    return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
-    inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
-    steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
-    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
+    angles = loop.crossing_angles
+    inside = (angles > 0) & (angles < np.pi) & (loop.crossing_signs != 0)
+    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
+    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     """Return the closed loop's eigenvalue of largest magnitude, with imaginary part >= 0."""
-    shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
-    n = loop.open.shape[-1]
-    opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))
-    period = np.broadcast_to(loop.period, shape)
+    shape = np.broadcast_shapes(loop.period_s.shape, np.shape(delay))
+    n = loop.open_multipliers.shape[-1]
+    opened, closed = (
+        np.broadcast_to(m, (*shape, n)) for m in (loop.open_multipliers, loop.closed_multipliers)
+    )
+    period = np.broadcast_to(loop.period_s, shape)
     delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
     D = 2 * delay / period
 
-    def loop_on_circle(growth: Array) -> CutLoop:
+    def rescaled_loop(growth: Array) -> CutLoop:
         radius = np.exp(growth * period)[..., None]
         return CutLoop.from_multipliers(
             opened / radius, closed / radius, period, radius[..., 0] ** D
@@ -132,25 +148,25 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
     # Bracket the growth rate: `low` has multipliers outside its circle, `high` has none.
     high, low = np.ones(shape), -np.ones(shape)
-    for _ in range(_DOUBLINGS):
-        some = count_unstable_multipliers(loop_on_circle(high), delay) > 0
-        none = count_unstable_multipliers(loop_on_circle(low), delay) == 0
+    for _ in range(_MAX_GROWTH_RATE_DOUBLINGS):
+        some = count_unstable_multipliers(rescaled_loop(high), delay) > 0
+        none = count_unstable_multipliers(rescaled_loop(low), delay) == 0
         if not (some | none).any():
             break
         high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
-    for _ in range(_HALVINGS):
+    for _ in range(_NUM_GROWTH_RATE_HALVINGS):
         middle = 0.5 * (low + high)
-        some = count_unstable_multipliers(loop_on_circle(middle), delay) > 0
+        some = count_unstable_multipliers(rescaled_loop(middle), delay) > 0
         low, high = np.where(some, middle, low), np.where(some, high, middle)
     # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
-    crossings = np.where(radius > 0, radius * np.exp(1j * loop_on_circle(high).angles), 0)
+    crossings = np.where(radius > 0, radius * np.exp(1j * rescaled_loop(high).crossing_angles), 0)
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
     found = np.zeros(z.shape, dtype=bool)
     with np.errstate(all="ignore"):
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_NUM_NEWTON_STEPS):
             to_open, to_closed = z[..., None] - opened, z[..., None] - closed
             P, M, delay_factor = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
             slope = P * (1 / to_open).sum(axis=-1) * (1 - delay_factor)
@@ -166,7 +182,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
 
 @njit(cache=True)
-def _loop_gain(closed, opened, angle, radius):
+def _loop_at(closed, opened, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
@@ -175,11 +191,11 @@ def _loop_gain(closed, opened, angle, radius):
 
 
 @njit(cache=True)
-def _find_crossings(opened, closed, levels, angles, found):
+def _write_gain_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop_gain(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
+        value = _loop_at(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
@@ -189,19 +205,17 @@ def _find_crossings(opened, closed, levels, angles, found):
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            size, phase = abs(value), _unwrapped_phase(value, last_phase)
+            size, phase = abs(value), _phase_nearest_to(value, last_phase)
             if (size > level) != (last_size > level) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    if (abs(_loop_gain(zeros, poles, middle, 1.0)) > level) == (last_size > level):
+                    if (abs(_loop_at(zeros, poles, middle, 1.0)) > level) == (last_size > level):
                         low = middle
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _unwrapped_phase(
-                    _loop_gain(zeros, poles, low, 1.0), last_phase
-                )
+                found[1, n, count] = _phase_nearest_to(_loop_at(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -227,7 +241,7 @@ def _add_pole_angles(angles, poles):
 def _add_gain_extremes(angles, poles, zeros, level):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
-        values[i] = _loop_gain(zeros, poles, angles[i], 1.0)
+        values[i] = _loop_at(zeros, poles, angles[i], 1.0)
     size = np.abs(values)
     more = np.empty(angles.shape[0])
     count = 0
@@ -236,15 +250,15 @@ def _add_gain_extremes(angles, poles, zeros, level):
         is_extreme = sign * size[i] >= max(sign * size[i - 1], sign * size[i + 1])
         if is_extreme and 0.5 * level < size[i] < 2.0 * level:
             low, high = angles[i - 1], angles[i + 1]
-            for _ in range(_GOLDEN_STEPS):
-                a, b = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
-                at_a, at_b = _loop_gain(zeros, poles, a, 1.0), _loop_gain(zeros, poles, b, 1.0)
+            for _ in range(_NUM_GOLDEN_SECTION_STEPS):
+                a, b = (high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low))
+                at_a, at_b = (_loop_at(zeros, poles, a, 1.0), _loop_at(zeros, poles, b, 1.0))
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:
                     low = a
             more[count] = 0.5 * (low + high)
-            values = np.append(values, _loop_gain(zeros, poles, more[count], 1.0))
+            values = np.append(values, _loop_at(zeros, poles, more[count], 1.0))
             count += 1
     if count == 0:
         return angles, values
@@ -254,6 +268,6 @@ def _add_gain_extremes(angles, poles, zeros, level):
 
 
 @njit(cache=True)
-def _unwrapped_phase(value, near):
+def _phase_nearest_to(value, near):
     phase = math.atan2(value.imag, value.real)
     return phase + 2.0 * math.pi * np.rint((near - phase) / (2.0 * math.pi))

@@ -54,13 +54,15 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
     )
 
 
-def diagram_figures(
+def summarise_diagram_stability(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
     """Return stability and slowest motion of linearised Diagram and one-axis model."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
-    one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
+    one_axis = _decay_and_frequency(
+        complex(dominant_multiplier(loop, axis.delay)), float(loop.period_s)
+    )
     figures: dict[str, Any] = {
         "point": name,
         "states": len(system.A) + lines,
@@ -70,11 +72,11 @@ def diagram_figures(
         "one_axis": one_axis,
     }
     if figures["states"] <= MAX_STATES:
-        figures |= _slowest_motion(system.multipliers[0], system.dt)
+        figures |= _decay_and_frequency(system.multipliers[0], system.dt)
     return figures
 
 
-def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
+def _decay_and_frequency(multiplier: complex, period: float) -> dict[str, Any]:
     return {
         "stable": bool(abs(multiplier) < 1),
         "decay_1_per_s": float(-np.log(abs(multiplier)) / period),
@@ -122,7 +124,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
     return rows
 
 
-def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
+def absolute_stability_values(H: Complex, axis: OneAxis) -> dict[str, Any]:
     """Return stability criteria for any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
@@ -138,7 +140,7 @@ def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
     }
 
 
-def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
@@ -157,7 +159,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
     return float("inf") if len(bad) == 0 else float(stiffness[max(bad[0] - 1, 0)])
 
 
-def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
+def transparency_values(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
     """Return displayed and ideal impedances, and the tracking bandwidth; `wall`: [N/m], [N s/m]."""
     fitted = OMEGA <= _FIT_BAND_RAD_S
     figures: dict[str, Any] = {}
@@ -187,7 +189,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
     return figures
 
 
-def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+def virtual_wall_limits(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -213,7 +215,7 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     }
 
 
-def measured_figures(
+def measure_free_impedance(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
     """Return the impedance displayed in free motion, measured in a simulation without friction."""

@@ -15,7 +15,7 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, 
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import ArmModel, jacobian
+from drake_teleop.station.slave.arm import jacobian
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -60,11 +60,11 @@ class MultiSine:
                 rotation=list(amplitude * direction[3:]),
             )
             for frequency, amplitude, phase in zip(
-                frequencies, amplitudes, self._phases(), strict=True
+                frequencies, amplitudes, self._phases_with_lowest_peak(), strict=True
             )
         ]
 
-    def _phases(self) -> Array:
+    def _phases_with_lowest_peak(self) -> Array:
         k = self.odd_multiples()
         draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
@@ -163,19 +163,15 @@ def measure_frequency_response(
 def _signals_along_task(
     result: SimulationResult, scenario: Scenario, task: TaskDirection
 ) -> dict[str, Array]:
-    arm = NominalSlave(scenario.slave).arm
-    return {
-        "hand_force": result["hand_wrench_E"] @ task.hand,
-        "hand_velocity": result["twist_master"] @ task.hand,
-        "felt_force": result["force_to_master"] @ task.hand,
-        "tool_velocity": _sensor_twists(arm, result["slave_state"]) @ task.tool,
-    }
-
-
-def _sensor_twists(arm: ArmModel, states: Array) -> Array:
+    arm, states = NominalSlave(scenario.slave).arm, result["slave_state"]
     n = arm.num_joints
     J, twists = np.empty((6, n)), np.empty((len(states), 6))
     for state, twist in zip(states, twists, strict=True):
         jacobian(arm.table, np.ascontiguousarray(state[:n]), J)
         twist[:] = J @ state[n:]
-    return twists
+    return {
+        "hand_force": result["hand_wrench_E"] @ task.hand,
+        "hand_velocity": result["twist_master"] @ task.hand,
+        "felt_force": result["force_to_master"] @ task.hand,
+        "tool_velocity": twists @ task.tool,
+    }

@@ -57,14 +57,16 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 # Displacements for differences: errors grow with their square, and with rounding over them.
 _ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
-_MAX_ACCELERATION_RAD_S2 = 20.0  # rad/s^2, requested of a joint: within the motors' torque
-_CONTACT_STEP = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_COMMANDED_ACCELERATION_RAD_S2 = (
+    20.0  # rad/s^2, requested of a joint: within the motors' torque
+)
+_JOINT_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
 _REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
 _MAX_NEWTON_STEPS = 8  # of Newton's method
-_RAMP_S, _SETTLE_S = 0.3, 0.1  # s, motion to the operating point, rest there
+_APPROACH_TIME_S, _REST_TIME_S = 0.3, 0.1  # s, motion to the operating point, rest there
 _MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
+_MAX_EIGENVALUE_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
@@ -120,9 +122,9 @@ class Linearization:
 
         Above 800 states they are only those near the unit circle, up to 100 Hz.
         """
-        size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
-        if size <= _MAX_DENSE_STATES:
-            values = np.linalg.eigvals(self.with_delays_as_states().A)
+        A = self._state_matrix_with_delays()
+        if (size := A.shape[0]) <= _MAX_DENSE_STATES:
+            values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
             raise DrakeTeleopError(
                 f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
@@ -131,15 +133,16 @@ class Linearization:
             )
         else:
             values = _find_eigenvalues_near_circle(
-                self._sparse_state_matrix(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
+                A.astype(complex).tocsc(), 2 * np.pi * _MAX_EIGENVALUE_FREQUENCY_HZ * self.dt
             )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
-    def _sparse_state_matrix(self, size: int) -> Any:
+    def _state_matrix_with_delays(self) -> Any:
         from scipy.sparse import lil_array
 
         n = end = len(self.A)
-        A = lil_array((size, size), dtype=complex)
+        size = n + sum(len(rows) * periods for rows, _, periods in self.loops)
+        A = lil_array((size, size))
         A[:n, :n] = self.A
         for rows, columns, periods in self.loops:
             start, width = end, len(rows)
@@ -148,14 +151,20 @@ class Linearization:
             A[:n, end - width : end] = self.B[:, columns]
             for k in range(start + width, end):
                 A[k, k - width] = 1.0
-        return A.tocsc()
+        return A
 
     def with_delays_as_states(self) -> Linearization:
         """Return the model with each delay as a shift register among the states."""
-        result = dataclasses.replace(self, loops=())
-        for rows, columns, periods in self.loops:
-            result = _add_shift_register(result, rows, columns, periods)
-        return result
+        A = self._state_matrix_with_delays().toarray()
+        delays = len(A) - len(self.A)
+        names = [
+            f"delayed {self.outputs[row]} {k + 1}"
+            for rows, _, periods in self.loops
+            for k in range(periods)
+            for row in rows
+        ]
+        B, C = np.pad(self.B, ((0, delays), (0, 0))), np.pad(self.C, ((0, 0), (0, delays)))
+        return dataclasses.replace(self, A=A, B=B, C=C, states=(*self.states, *names), loops=())
 
     def to_control(self) -> Any:
         """Return a discrete `control.StateSpace`; the name "port.x" becomes "port[x]"."""
@@ -172,7 +181,7 @@ class Linearization:
 
     @staticmethod
     def _find_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
-        parts = _axis_names(names) if isinstance(names, str) else names
+        parts = _port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
@@ -203,21 +212,6 @@ def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
     return found
 
 
-def _add_shift_register(
-    system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
-) -> Linearization:
-    n, width = len(system.A), len(rows)
-    size = n + width * periods
-    A, B = np.zeros((size, size)), np.zeros((size, len(system.inputs)))
-    C = np.zeros((len(system.outputs), size))
-    A[:n, :n], B[:n], C[:, :n] = system.A, system.B, system.C
-    A[n : n + width, :n] = system.C[list(rows)]
-    A[n + width :, n : size - width] = np.eye(size - n - width)
-    A[:n, size - width :] = system.B[:, columns]
-    names = [f"delayed {system.outputs[row]} {k + 1}" for k in range(periods) for row in rows]
-    return dataclasses.replace(system, A=A, B=B, C=C, states=(*system.states, *names))
-
-
 def linearize(
     scenario: Scenario,
     *,
@@ -242,11 +236,18 @@ def linearize(
     D = np.zeros((len(C), B.shape[1]))
     A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
     return Linearization(
-        A, B, C, D, period.dt, names, _axis_names(*_INPUT_PORTS), _axis_names(*_OUTPUT_PORTS)
+        A,
+        B,
+        C,
+        D,
+        period.dt,
+        names,
+        _port_component_names(*_INPUT_PORTS),
+        _port_component_names(*_OUTPUT_PORTS),
     )
 
 
-def _axis_names(*ports: str) -> tuple[str, ...]:
+def _port_component_names(*ports: str) -> tuple[str, ...]:
     return tuple(f"{port}.{axis}" for port in ports for axis in COMPONENT_NAMES)
 
 
@@ -319,10 +320,10 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _StateGroup:
-    system: str
-    group: int | None
-    part: slice | NDArray[np.intp]
-    steps: Array  # displacements for the differences
+    system_name: str
+    discrete_group: int | None
+    indices: slice | NDArray[np.intp]
+    difference_steps: Array  # displacements for the differences
 
 
 class _PeriodSimulator:
@@ -357,23 +358,23 @@ class _PeriodSimulator:
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
-        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_RAD_S2 / gain)
+        self._command_step = min(_ANGLE_STEP, _MAX_COMMANDED_ACCELERATION_RAD_S2 / gain)
         has_contact = smooth.surroundings is not None
         self._joint_step = (
-            min(self._command_step, _CONTACT_STEP) if has_contact else self._command_step
+            min(self._command_step, _JOINT_STEP_IN_CONTACT) if has_contact else self._command_step
         )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
-        self._steps = np.concatenate([group.steps for group in self._groups])
+        self._steps = np.concatenate([group.difference_steps for group in self._groups])
         # The sensor's memory follows from the other states; it is of order 1.
-        sensed = [group.system == "wrist_sensor" for group in self._groups]
-        counts = [len(group.steps) for group in self._groups]
+        sensed = [group.system_name == "wrist_sensor" for group in self._groups]
+        counts = [len(group.difference_steps) for group in self._groups]
         self._sizes = np.where(np.repeat(sensed, counts), _UNIT_STEP, self._steps)
         self.states = tuple(
-            f"{g.system} {'' if g.group is None else g.group}[{k}]"
+            f"{g.system_name} {'' if g.discrete_group is None else g.discrete_group}[{k}]"
             for g in self._groups
-            for k in range(len(g.steps))
+            for k in range(len(g.difference_steps))
         )
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
@@ -402,7 +403,7 @@ class _PeriodSimulator:
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
         remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
-        return [
+        groups = [
             whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
             whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
             whole_group("master_device", 2, np.full(6, _RATE_STEP)),
@@ -413,33 +414,33 @@ class _PeriodSimulator:
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
             _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
-            *self._ik_state_groups(),
         ]
-
-    def _ik_state_groups(self) -> list[_StateGroup]:
-        steps = np.full(self._joints, self._command_step)
-        command = _StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps)
-        return [command] if self._has_ik_state else []
+        if self._has_ik_state:
+            steps = np.full(self._joints, self._command_step)
+            groups.append(_StateGroup("inverse_kinematics", 0, slice(0, self._joints), steps))
+        return groups
 
     def get_state(self) -> Array:
         parts = []
         for group in self._groups:
-            context = self._get_context(group.system)
-            if group.group is None:
+            context = self._get_context(group.system_name)
+            if group.discrete_group is None:
                 parts.append(context.get_continuous_state_vector().CopyToVector())
             else:
-                parts.append(context.get_discrete_state(group.group).value()[group.part])
+                parts.append(
+                    context.get_discrete_state(group.discrete_group).value()[group.indices]
+                )
         return np.concatenate(parts)
 
     def _set_state(self, x: Array) -> None:
-        ends = np.cumsum([len(group.steps) for group in self._groups])
+        ends = np.cumsum([len(group.difference_steps) for group in self._groups])
         for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
-            context = self._get_context(group.system)
-            if group.group is None:
+            context = self._get_context(group.system_name)
+            if group.discrete_group is None:
                 context.SetContinuousState(values)
             else:
-                state = context.get_mutable_discrete_state(group.group)
-                state.get_mutable_value()[group.part] = values
+                state = context.get_mutable_discrete_state(group.discrete_group)
+                state.get_mutable_value()[group.indices] = values
         self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
     def _apply_inputs(self, u: Array) -> None:
@@ -450,9 +451,6 @@ class _PeriodSimulator:
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
         self._fix_input("slave_plant", "applied_spatial_force", [self._push])
         self._fix_input("wrist_sensor", "applied_wrench_W", push)
-
-    def _read_slave_state(self) -> Array:
-        return self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
 
     def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
@@ -468,10 +466,8 @@ class _PeriodSimulator:
         return self.get_state()
 
     def _evaluate_outputs(self) -> Array:
-        pose, state = (
-            self._evaluate_output("kinematic_scaling", "pose_command"),
-            self._read_slave_state(),
-        )
+        pose = self._evaluate_output("kinematic_scaling", "pose_command")
+        state = self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
         J = np.empty((6, self._joints))
         jacobian(self._arm, state[: self._joints], J)
         return np.concatenate(
@@ -499,8 +495,8 @@ class _PeriodSimulator:
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
-        ramp = round(_RAMP_S / self.dt) if displacement.any() else 0
-        for k in range(ramp + round(_SETTLE_S / self.dt)):
+        ramp = round(_APPROACH_TIME_S / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_REST_TIME_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)

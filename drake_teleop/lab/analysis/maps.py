@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"
-_PARAMETERS = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
+_PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
 _NUM_BISECTION_STEPS = 10
 _DISTORTION_BAND_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # of deliberate movements
 
@@ -42,13 +42,13 @@ class StabilityMap:
     y_name: str
     x: Array  #: (nx,) values of the first parameter
     y: Array  #: (ny,) values of the second parameter
-    unstable: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
+    num_unstable_multipliers: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
     distortion: Array  #: (ny, nx), valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        return self.unstable == 0
+        return self.num_unstable_multipliers == 0
 
 
 def stability_map(
@@ -63,16 +63,16 @@ def stability_map(
 
     Parameters: fields of `OneAxis`, "low_pass_hz", or "rate" (all rates in proportion).
     """
-    xs, ys = _check_increasing(x_name, x), _check_increasing(y_name, y)
+    xs, ys = _check_parameter_values(x_name, x), _check_parameter_values(y_name, y)
 
-    def loops_at(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
-        return _loops_with_values(axis, sampling, {x_name: at_x, y_name: at_y})
+    def axis_and_loop_at(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
+        return _axis_and_loop_with_values(axis, sampling, {x_name: at_x, y_name: at_y})
 
     def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
-        moved, loop = loops_at(at_x, at_y)
+        moved, loop = axis_and_loop_at(at_x, at_y)
         return count_unstable_multipliers(loop, moved.delay) == 0
 
-    moved, loop = loops_at(xs, ys[:, None])
+    moved, loop = axis_and_loop_at(xs, ys[:, None])
     shape = len(ys), len(xs)
     unstable = np.broadcast_to(count_unstable_multipliers(loop, moved.delay), shape)
     stable = unstable == 0
@@ -97,7 +97,7 @@ def force_distortion(
 ) -> Array:
     """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
-        loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
+        loop.period_s.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
     )
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     s: Complex = 1j * w.reshape(-1, *[1] * len(shape))
@@ -107,12 +107,12 @@ def force_distortion(
     return np.abs(exerted / ideal - 1).max(axis=0)
 
 
-def _check_increasing(name: str, values: ArrayLike) -> Array:
-    if name not in _PARAMETERS:
+def _check_parameter_values(name: str, values: ArrayLike) -> Array:
+    if name not in _PARAMETER_NAMES:
         raise DrakeTeleopError(
             f"'{name}' is no parameter of a stability map",
             where="stability_map",
-            remedy=f"choose one of {', '.join(sorted(_PARAMETERS))}",
+            remedy=f"choose one of {', '.join(sorted(_PARAMETER_NAMES))}",
         )
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
@@ -124,7 +124,7 @@ def _check_increasing(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _loops_with_values(
+def _axis_and_loop_with_values(
     axis: OneAxis, sampling: Sampling, values: dict[str, Any]
 ) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():

@@ -21,7 +21,7 @@ Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Axis:
+class AxisParameters:
     """Parameters of all models of one direction; default: the paper's station with medium grip.
 
     sigma and gamma are the displayed shares of the tool's inertial force and of the contact force.
@@ -51,8 +51,11 @@ class Axis:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OneAxis(Axis):
-    """`Axis` with damping of device and wall, mass error, motion scale, delay; arrays broadcast."""
+class OneAxis(AxisParameters):
+    """Parameters with damping of device and wall, mass error, motion scale and delay.
+
+    Arrays broadcast.
+    """
 
     device_damping: float = 0.5  #: N s/m
     mass_error: float = 0.0  #: kg, estimated minus true tool mass

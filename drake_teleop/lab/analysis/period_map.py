@@ -21,9 +21,9 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
-X_M, V_M, SERVO, X_S, V_S, SAMPLE, FILTER = range(7)
+(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
-_HAND, _ENVIRONMENT, RECEIVED = -3, -2, -1
+_HAND_FORCE, _ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
 _MAX_RATE_RATIO = 1000
 
 
@@ -37,13 +37,13 @@ class Sampling:
     low_pass_hz: float | None = None  #: of the sensor's 4th-order Butterworth filter; None: ideal
 
 
-def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
+def delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
     """Return the one-way delay in whole hand periods, at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
 
 
-def cut_period_map(axis: OneAxis, sampling: Sampling) -> Array:
+def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     """Return the model's matrix over one hand period, with the loop cut at the received force.
 
     The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
@@ -59,8 +59,8 @@ def cut_period_map(axis: OneAxis, sampling: Sampling) -> Array:
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
-    n = FILTER + 2 * sections.shape[-2]
-    rows = _MatrixRows(axis, n + 3)
+    n = FIRST_FILTER + 2 * sections.shape[-2]
+    rows = _PeriodMapRows(axis, n + 3)
     hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
@@ -72,13 +72,13 @@ def cut_period_map(axis: OneAxis, sampling: Sampling) -> Array:
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
         if time == 0:
-            new[..., [X_M, V_M], :] = hand @ M
+            new[..., [MASTER_X, MASTER_V], :] = hand @ M
         if (time * servo_samples).denominator == 1:
-            new[..., [SERVO], :] = servo @ M
+            new[..., [SERVO_A], :] = servo @ M
         if (time * sensor_samples).denominator == 1:
-            new[..., SAMPLE:n, :] = sensor @ M
+            new[..., SAMPLED_FORCE:n, :] = sensor @ M
         M = new
-        M[..., [X_S, V_S], :] = flows[gap] @ M
+        M[..., [SLAVE_X, SLAVE_V], :] = flows[gap] @ M
     return M
 
 
@@ -95,13 +95,13 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
         wall_stiffness=0.0,
         wall_damping=0.0,
     )
-    M = cut_period_map(bare, sampling)
+    M = period_map_of_cut_loop(bare, sampling)
     n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     z = np.exp(1j * w * period)
-    delay_factor = z ** -delay_steps(axis, sampling)
+    delay_factor = z ** -delay_in_hand_periods(axis, sampling)
     # Responses without delay to a force on the device, and to one of the environment.
-    C = np.eye(n)[[V_M, V_S, SAMPLE]]
+    C = np.eye(n)[[MASTER_V, SLAVE_V, SAMPLED_FORCE]]
     response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
     (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
     hold = -np.expm1(-1j * w * period) / (1j * w * period)
@@ -142,7 +142,7 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     return sections.reshape(*rates.shape, 2, 5)
 
 
-class _MatrixRows:
+class _PeriodMapRows:
     def __init__(self, axis: OneAxis, size: int) -> None:
         self._axis, self._size = axis, size
 
@@ -155,43 +155,41 @@ class _MatrixRows:
             row[..., index] += value
         return row
 
-    def _environment_entries(self) -> dict[int, Any]:
-        return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
-
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
-        x, v, push = _held_response(0.0, axis.device_damping / mass, period)
+        x, v, push = _spring_response(0.0, axis.device_damping / mass, period)
         hand_force = {
-            X_M: -axis.hand_stiffness / mass,
-            V_M: -axis.hand_damping / mass,
-            _HAND: 1 / mass,
+            MASTER_X: -axis.hand_stiffness / mass,
+            MASTER_V: -axis.hand_damping / mass,
+            _HAND_FORCE: 1 / mass,
         }
-        force = self._make_row(hand_force) + self._make_row({RECEIVED: -1 / mass})
+        force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
-            ahead[i] = ahead[i] + self._make_row({X_M: x[..., i], V_M: v[..., i]})
+            ahead[i] = ahead[i] + self._make_row({MASTER_X: x[..., i], MASTER_V: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
     def servo_rows(self) -> Array:
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
-        row = self._make_row({X_M: kv * kp * self._axis.position_scale})
-        return (row + self._make_row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
+        row = self._make_row({MASTER_X: kv * kp * self._axis.position_scale})
+        return (row + self._make_row({SLAVE_X: -kv * kp, SLAVE_V: -kv}))[..., None, :]
 
     def sensor_rows(self, sections: Array) -> Array:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
-        environment = axis.gamma - felt_mass / axis.slave_mass
-        value = self._make_row(
-            {
-                index: axis.force_scale * environment * share
-                for index, share in self._environment_entries().items()
-            }
-        ) + self._make_row({SERVO: axis.force_scale * felt_mass})
+        scale = axis.force_scale * (axis.gamma - felt_mass / axis.slave_mass)
+        contact_force = {
+            SLAVE_X: scale * axis.wall_stiffness,
+            SLAVE_V: scale * axis.wall_damping,
+            _ENVIRONMENT_FORCE: scale,
+        }
+        load_force = {SERVO_A: axis.force_scale * felt_mass}
+        value = self._make_row(contact_force) + self._make_row(load_force)
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
-            first, second = FILTER + 2 * k, FILTER + 2 * k + 1
+            first, second = FIRST_FILTER + 2 * k, FIRST_FILTER + 2 * k + 1
             filtered = b0 * value + self._make_row({first: 1.0})
             memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
             memory.append(b2 * value - a2 * filtered)
@@ -201,17 +199,24 @@ class _MatrixRows:
     def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
-        x, v, push = _held_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
+        x, v, push = _spring_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
         rows = []
         for i in range(2):
             p = push[..., i]
             rows.append(
-                self._make_row({X_S: x[..., i], V_S: v[..., i], SERVO: p, _ENVIRONMENT: -p / mass})
+                self._make_row(
+                    {
+                        SLAVE_X: x[..., i],
+                        SLAVE_V: v[..., i],
+                        SERVO_A: p,
+                        _ENVIRONMENT_FORCE: -p / mass,
+                    }
+                )
             )
         return np.stack(rows, axis=-2)
 
 
-def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
+def _spring_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
     # (x, x') after `time` of x'' = u - b x' - k x, from x = 1, from x' = 1, and for u = 1.
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))

@@ -47,7 +47,7 @@ _AXIS_LABELS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class ReportCurves:
     """Data of the report's pictures that the summary does not contain."""
 
     axis: OneAxis
@@ -59,13 +59,13 @@ class Curves:
     maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
 
-def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
+def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) -> None:
     pictures = {
         "bode": draw_bode(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
-        "passive": draw_passive_loads(curves),
+        "passive": draw_absolute_stability(curves),
         "widths": draw_z_widths(curves, summary["z_width"]),
-        "maps": draw_maps(curves, summary["grip"]),
+        "maps": draw_stability_maps(curves, summary["grip"]),
     }
     for name, figure in pictures.items():
         write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
@@ -118,7 +118,7 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
     )
 
 
-def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
+def draw_bode(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     stiffness, damping = curves.wall
     environments = {
@@ -157,7 +157,7 @@ def _phase_degrees(felt: Complex) -> Any:
     return np.degrees(np.unwrap(np.angle(felt)))
 
 
-def draw_nyquist(curves: Curves) -> Figure:
+def draw_nyquist(curves: ReportCurves) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
@@ -176,7 +176,7 @@ def draw_nyquist(curves: Curves) -> Figure:
     return figure
 
 
-def draw_passive_loads(curves: Curves) -> Figure:
+def draw_absolute_stability(curves: ReportCurves) -> Figure:
     """Draw Llewellyn's parameter, the scattering norm, and structured singular values mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
@@ -209,7 +209,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
     return figure
 
 
-def draw_z_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
+def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_z_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
@@ -239,14 +239,14 @@ def draw_z_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_maps(curves: Curves, grip: str) -> Figure:
+def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
     """Draw the stability maps; the distortion is that of `grip`."""
     with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
         cells = figure.subplots(rows, 2, squeeze=False).ravel()
         for axes, (title, shown) in zip(cells, curves.maps.items(), strict=False):
-            mesh = _draw_map(axes, shown, grip)
+            mesh = _draw_stability_map(axes, shown, grip)
             axes.set_title(title)
         for axes in cells[len(curves.maps) :]:
             axes.set_axis_off()
@@ -259,7 +259,7 @@ def draw_maps(curves: Curves, grip: str) -> Figure:
     return figure
 
 
-def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
+def _draw_stability_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
     one = shown[grip]
     (x_label, x_factor), (y_label, y_factor) = _AXIS_LABELS[one.x_name], _AXIS_LABELS[one.y_name]
     x, y = x_factor * one.x, y_factor * one.y

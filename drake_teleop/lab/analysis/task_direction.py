@@ -81,7 +81,7 @@ def task_direction(
     slave = NominalSlave(scenario.slave)
     arm = slave.arm
     displacement_W = scaling.translation_scale * R_WB @ displacement_B
-    q = _find_slave_posture(slave, displacement_W)
+    q = _find_displaced_posture(slave, displacement_W)
     J, R_WS, p_WS = np.empty((6, arm.num_joints)), np.empty((3, 3)), np.empty(3)
     jacobian(arm.table, q, J)
     forward_kinematics(arm.table, q, R_WS, p_WS)
@@ -142,7 +142,7 @@ def _device_mass_and_damping(
     return float(1 / mobility - hand.mass), float(damping)
 
 
-def _find_slave_posture(slave: SlavePlant, moved: Array) -> Array:
+def _find_displaced_posture(slave: SlavePlant, moved: Array) -> Array:
     arm, pose = slave.arm, slave.X_WS_start.copy()
     pose[4:] += moved
     if has_closed_form(arm):

@@ -21,9 +21,9 @@ from drake_teleop.common.files import make_folder, output_folder, write_json, wr
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.delayed_contact import (
-    LEAF_SPRINGS,
+    LEAF_THICKNESSES_M,
     delayed_contact,
-    station_figures,
+    figures_of_station_run,
     vertical_traces,
 )
 from drake_teleop.lab.comparison.one_dof import (
@@ -59,9 +59,9 @@ WALL_STIFFNESSES_N_M = (500.0, 5100.0, 20000.0)  #: N/m
 NETWORK_IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
-_COVERING_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_INJECTED_ENERGY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
-_RUN_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_STATION_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_STEP_S = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
@@ -98,7 +98,7 @@ def compare_command(
         limits = _run_one_dof_study(methods, seed, jobs, stage)
         released = _run_release_study(networks, methods, seed, jobs, stage)
         runs, traces = _run_station_study(scenario, networks, methods, seed, jobs, stage)
-        covering = _run_covering_study(stage)
+        covering = _run_injected_energy_study(stage)
     summary = {
         "networks": list(networks),
         "methods": list(methods),
@@ -114,9 +114,9 @@ def compare_command(
             "method": method,
             "network": network,
             "verdict": cell.verdict,
-            "felt_N": [felt for felt, _ in cell.forces],
-            "pressed_N": [pressed for _, pressed in cell.forces],
-            "leaked_J": cell.leaked,
+            "felt_N": [felt for felt, _ in cell.force_pairs],
+            "pressed_N": [pressed for _, pressed in cell.force_pairs],
+            "leaked_J": cell.leaked_J,
         }
         for (method, network), cell in decision_table(summary).items()
     ]
@@ -153,7 +153,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP_S),
-        rates=_RUN_RATES,
+        rates=_STATION_RATES,
         contact_detection=None,
     )
 
@@ -171,11 +171,11 @@ def simulate_press(
     setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
-        result, found = _run_to_end_or_hold(station, setup, task)
+        result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
-    held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
+    held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
@@ -184,22 +184,24 @@ def simulate_press(
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
-    return row | _replace_nonfinite(dataclasses.asdict(found) | additional) | {"error": None}, shown
+    for name, value in (dataclasses.asdict(found) | additional).items():
+        row[name] = None if isinstance(value, float) and not np.isfinite(value) else value
+    return row | {"error": None}, shown
 
 
-def _run_to_end_or_hold(
+def _run_while_stable(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, RunMeasures]:
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
-    hold = dataclasses.replace(task, end=task.release)
+    hold = dataclasses.replace(task, end=task.release_start)
     for part in (hold, task):
         advance_without_garbage_collection(
             simulator, 1e-3 * round(1e3 * (settle + part.end))
         )  # exactly to the event
         result = read_recorded_signals(simulator, settle)
-        found = station_figures(result, scenario, part)
+        found = figures_of_station_run(result, scenario, part)
         if not found.stable:
             break
     # Without rest in the hold the drift is not defined.
@@ -264,7 +266,7 @@ def _run_station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, LEAF_SPRINGS, methods))
+    cases = list(itertools.product(slowest, LEAF_THICKNESSES_M, methods))
     results = _run_parallel(
         simulate_press,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
@@ -272,13 +274,14 @@ def _run_station_study(
         stage("The whole station"),
     )
     order = {
-        name: list(names).index for name, names in (("network", networks), ("leaf", LEAF_SPRINGS))
+        name: list(names).index
+        for name, names in (("network", networks), ("leaf", LEAF_THICKNESSES_M))
     }
     rows = sorted(
         (row for row, _ in results),
         key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
     )
-    first = next(iter(LEAF_SPRINGS))
+    first = next(iter(LEAF_THICKNESSES_M))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results
@@ -287,9 +290,9 @@ def _run_station_study(
     return rows, traces
 
 
-def _run_covering_study(stage: StartStage) -> list[dict[str, Any]]:
+def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
-    for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
+    for done, (sigma, round_trip, wall) in enumerate(_INJECTED_ENERGY_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         rows.append(
@@ -301,7 +304,7 @@ def _run_covering_study(stage: StartStage) -> list[dict[str, Any]]:
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )
-        progress((done + 1) / len(_COVERING_CASES))
+        progress((done + 1) / len(_INJECTED_ENERGY_CASES))
     return rows
 
 
@@ -316,10 +319,3 @@ def _run_parallel(
         results.append(result)
         progress(len(results) / len(cases))
     return results
-
-
-def _replace_nonfinite(figures: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: None if isinstance(value, float) and not np.isfinite(value) else value
-        for name, value in figures.items()
-    }

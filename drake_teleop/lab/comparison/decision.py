@@ -24,21 +24,21 @@ class MethodResult:
 
     verdict: str
     #: For each leaf, means in the hold of the force on the hand and the scaled contact force [N].
-    forces: tuple[tuple[float, float], ...] = ()
-    unrest: tuple[str, ...] = ()  #: for each leaf, motion in the hold as text; stable: empty
-    leaked: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
+    force_pairs: tuple[tuple[float, float], ...] = ()
+    motion_texts: tuple[str, ...] = ()  #: for each leaf, motion in the hold as text; stable: empty
+    leaked_J: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
 
     @property
     def verdict_text(self) -> str:
-        if self.verdict != VERDICT_LEAKS or self.leaked is None:
+        if self.verdict != VERDICT_LEAKS or self.leaked_J is None:
             return self.verdict
-        number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
+        number, unit = (1e3 * self.leaked_J, "mJ") if self.leaked_J < 1.0 else (self.leaked_J, "J")
         return f"leaks {_format_two_digits(number)} {unit}"
 
     @property
     def displayed_share(self) -> str:
         """Least displayed over scaled contact force of all leaf springs [%]; "" if unstable."""
-        shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
+        shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
@@ -59,15 +59,17 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
 
 def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
     if not all(run["stable"] for run in runs):
-        return MethodResult(VERDICT_UNSTABLE, unrest=tuple(map(_describe_motion_in_hold, runs)))
+        return MethodResult(
+            VERDICT_UNSTABLE, motion_texts=tuple(map(_describe_motion_in_hold, runs))
+        )
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
-        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked=leaked)
+        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
     if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_N:
-        return MethodResult(VERDICT_CHATTERS, forces, leaked=leaked)
+        return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
     return MethodResult(
-        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked=leaked
+        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked_J=leaked
     )
 
 

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import copy_into, quaternion_of_matrix
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
@@ -19,26 +17,26 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, 
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
-from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.plant import NominalSlave
 
-_START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
-_LEAF_LENGTH, _LEAF_WIDTH = 0.12, 0.05  # m
+_START_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+_LEAF_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
 #: Leaves by name: thickness [m], light enough not to oscillate.
-LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
+LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
     """Return the times of the task for a round-trip delay [s]."""
     return Task(
-        swing=0.3,
-        swung=1.8,
-        press=2.3 + round_trip,
-        pressed=3.1 + round_trip,
-        release=5.1 + 4 * round_trip,
-        released=5.9 + 4 * round_trip,
+        swing_start=0.3,
+        swing_end=1.8,
+        press_start=2.3 + round_trip,
+        press_end=3.1 + round_trip,
+        release_start=5.1 + 4 * round_trip,
+        release_end=5.9 + 4 * round_trip,
         end=8.1 + 6 * round_trip,
-        judged=1.0,
+        rest_window=1.0,
     )
 
 
@@ -49,38 +47,38 @@ def delayed_contact(
     leaf: str | float,
     *,
     task: Task | None = None,
-    depth: float = _PRESS_DEPTH,
+    depth: float = _PRESS_DEPTH_M,
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    `leaf` is a key of `LEAF_SPRINGS` or a stiffness [N/m]; `depth` [m] is the hand's intended
+    `leaf` is a key of `LEAF_THICKNESSES_M` or a stiffness [N/m]; `depth` [m] is the hand's intended
     displacement beyond the contact.
     """
     task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
     settle = 0.5
     swing = Sine(
-        t_start=settle + task.swing,
-        duration=task.swung - task.swing,
+        t_start=settle + task.swing_start,
+        duration=task.swing_end - task.swing_start,
         ramp=0.5,
         frequency=1.5,
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],
     )
     scale = base.kinematic_scaling.translation_scale
-    reach = [0.0, 0.0, -(_START_GAP / scale + depth)]
+    reach = [0.0, 0.0, -(_START_GAP_M / scale + depth)]
     press, retreat = (
         MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
         for start, end, translation in (
-            (task.press, task.pressed, reach),
-            (task.release, task.released, [-x for x in reach]),
+            (task.press_start, task.press_end, reach),
+            (task.release_start, task.release_end, [-x for x in reach]),
         )
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
     sheet = SheetSpring(
-        position=[x, y, z - _START_GAP],
-        length=_LEAF_LENGTH,
-        width=_LEAF_WIDTH,
-        thickness=LEAF_SPRINGS[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
+        position=[x, y, z - _START_GAP_M],
+        length=_LEAF_LENGTH_M,
+        width=_LEAF_WIDTH_M,
+        thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
     return (
         replace(
@@ -97,13 +95,13 @@ def delayed_contact(
 
 def leaf_thickness(stiffness: float) -> float:
     """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
-    unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
+    unit = SheetSpring(length=_LEAF_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
-def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
+def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
     """Return the measures of a run of the task."""
-    heights, turned = _slave_motion(result, scenario)
+    heights, turned = _slave_heights_and_rotations(result, scenario)
     scaling = scenario.force_scaling
     return figures_of_traces(
         t=result.t,
@@ -136,23 +134,12 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
-def _slave_motion(
+def _slave_heights_and_rotations(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     arm = slave_arm(scenario)
-    q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
-    poses = _sensor_poses(arm.table, q)
+    poses = np.empty((len(result.t), 7))
+    for pose, state in zip(poses, result["slave_state"], strict=True):
+        pose_into(arm.table, np.ascontiguousarray(state[: arm.num_joints]), pose)
     rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
-
-
-@njit(cache=True)
-def _sensor_poses(arm, q):
-    R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
-    for k in range(q.shape[0]):
-        forward_kinematics(arm, q[k], R, p)
-        orientation = quaternion_of_matrix(R)
-        for i in range(4):
-            poses[k, i] = orientation[i]
-        copy_into(poses[k], 4, p, 0, 3)
-    return poses

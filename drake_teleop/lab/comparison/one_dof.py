@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_normal
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.lab.analysis.one_axis import Axis
+from drake_teleop.lab.analysis.one_axis import AxisParameters
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
     MASTER_METHOD_MEMORY,
@@ -35,29 +35,29 @@ _FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb fricti
 _SLAVE_FRICTION_SPEED_M_S = 1e-3  # m/s, regularisation of the slave's friction
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
-_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
+_RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
 TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
-_REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intended depth
+_REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
 
 @dataclass(frozen=True)
 class Task:
     """Times of the operator's task [s]: swing, rest, press, hold, retreat, rest."""
 
-    swing: float = 0.5
-    swung: float = 3.0
-    press: float = 5.5
-    pressed: float = 6.5
-    release: float = 11.5
-    released: float = 12.5
+    swing_start: float = 0.5
+    swing_end: float = 3.0
+    press_start: float = 5.5
+    press_end: float = 6.5
+    release_start: float = 11.5
+    release_end: float = 12.5
     end: float = 17.0
-    judged: float = 1.9  #: length of the windows in which rest is required
+    rest_window: float = 1.9  #: length of the windows in which rest is required
 
 
 @dataclass(frozen=True, kw_only=True)
-class OneDof(Axis):
-    """`Axis` with Coulomb friction, no device damping, and lag, encoders, noise, model errors.
+class OneDof(AxisParameters):
+    """Parameters with Coulomb friction, no device damping, and lag, encoders, noise, model errors.
 
     The equations of motion are::
 
@@ -74,9 +74,9 @@ class OneDof(Axis):
     master_resolution: float = 0.0  #: m, of the master's encoder; 0: exact
     slave_resolution: float = 0.0  #: m, of the slave's encoder; 0: exact
     wrench_noise: float = 0.0  #: N, standard deviation of the wrist's force
-    believed_stiffness: float = 1.0  #: configured servo stiffness over the true one
-    believed_damping: float = 1.0  #: configured servo damping over the true one
-    believed_mass: float = 1.0  #: configured slave mass over the true one
+    configured_stiffness_ratio: float = 1.0  #: configured servo stiffness over the true one
+    configured_damping_ratio: float = 1.0  #: configured servo damping over the true one
+    configured_mass_ratio: float = 1.0  #: configured slave mass over the true one
 
 
 REFERENCE = OneDof(
@@ -113,8 +113,8 @@ class OneDofRun:
     command: NDArray[np.float64]  #: m, received by the slave
     felt: NDArray[np.float64]  #: N, on the hand
     wall: NDArray[np.float64]  #: N, on the slave
-    energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
-    silent: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
+    channel_energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
+    time_without_packets: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
     accounts: NDArray[np.float64]  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
@@ -169,9 +169,9 @@ def run_one_dof(
     scale = model.force_scale
     passivity = dataclasses.replace(
         passivity,
-        servo_stiffness=[model.believed_stiffness * model.servo_stiffness] * 2,
-        servo_damping=[model.believed_damping * model.servo_damping] * 2,
-        slave_mass=[model.believed_mass * model.slave_mass] * 2,
+        servo_stiffness=[model.configured_stiffness_ratio * model.servo_stiffness] * 2,
+        servo_damping=[model.configured_damping_ratio * model.servo_damping] * 2,
+        slave_mass=[model.configured_mass_ratio * model.slave_mass] * 2,
     )
     p = methods.method_parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
     intent = operator_intent() if intent is None else intent
@@ -222,12 +222,14 @@ def run_one_dof(
 def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
-    x = np.full_like(t, _REST_POSITION)
-    fade = np.minimum(_smooth_ramp(t, task.swing, 0.5), 1 - _smooth_ramp(t, task.swung - 0.5, 0.5))
-    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
-    pressing = _smooth_ramp(t, task.press, task.pressed - task.press)
-    releasing = _smooth_ramp(t, task.release, task.released - task.release)
-    x += (_DEPTH - _REST_POSITION) * (pressing - releasing)
+    x = np.full_like(t, _REST_POSITION_M)
+    fade = np.minimum(
+        _smooth_ramp(t, task.swing_start, 0.5), 1 - _smooth_ramp(t, task.swing_end - 0.5, 0.5)
+    )
+    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing_start))
+    pressing = _smooth_ramp(t, task.press_start, task.press_end - task.press_start)
+    releasing = _smooth_ramp(t, task.release_start, task.release_end - task.release_start)
+    x += (_PRESS_DEPTH_M - _REST_POSITION_M) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
@@ -243,7 +245,7 @@ def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMea
         slave=run.slave,
         felt=run.felt,
         pressed=model.force_scale * model.gamma * run.wall,
-        energy=run.energy.sum(axis=1),
+        energy=run.channel_energy.sum(axis=1),
         task=task,
     )
 
@@ -272,14 +274,14 @@ def figures_of_traces(
     def window_slice(start: float, stop: float) -> slice:
         return slice(round(start / dt), round(stop / dt))
 
-    hold = window_slice(task.release - task.judged, task.release)
-    rest = window_slice(task.end - task.judged, task.end)
-    hunting = max(_peak_to_peak(x[part]) for x in (master, slave) for part in (hold, rest))
+    hold = window_slice(task.release_start - task.rest_window, task.release_start)
+    rest = window_slice(task.end - task.rest_window, task.end)
+    hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max((_peak_to_peak(x[part]) for x in angles for part in (hold, rest)), default=0.0)
+    turning = max((_detrended_range(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
-    after = min(round((task.released + 2.0) / dt), len(t) - 1)
-    start = round(task.press / dt)
+    after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
+    start = round(task.press_start / dt)
     return RunMeasures(
         stable=bool(
             hunting < _MAX_MOTION_AT_REST_M and turning < _MAX_MOTION_AT_REST_M / TIP_DISTANCE_M
@@ -290,8 +292,10 @@ def figures_of_traces(
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(np.sqrt(np.mean(felt[window_slice(task.swing, task.swung)] ** 2))),
-        rise_delay=_rise_delay(felt[start:], pressed[start:], steady) * dt,
+        free_force=float(
+            np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
+        ),
+        rise_delay=_rise_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
 
@@ -302,7 +306,7 @@ def covering_damping(model: OneDof, round_trip: float) -> float:
 
 
 def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
-    s = 1j * _FREQUENCIES_RAD_S
+    s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
@@ -314,14 +318,14 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float6
     return np.asarray(felt.real)
 
 
-def _peak_to_peak(x: NDArray[np.float64]) -> float:
+def _detrended_range(x: NDArray[np.float64]) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
+def _rise_samples(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))

@@ -55,7 +55,7 @@ Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
     pictures = {
-        "decision": draw_decision(summary),
+        "decision": draw_decision_table(summary),
         "hands": draw_release_and_taps(summary),
         "runs": draw_force_traces(summary, traces),
         "energy": draw_energy(summary, traces),
@@ -83,7 +83,7 @@ def run_cells(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def draw_decision(summary: Mapping[str, Any]) -> Figure:
+def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
     methods, networks, table = summary["methods"], summary["networks"], decision_table(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
@@ -92,8 +92,10 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICT_STYLES[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
-            lines += cell.unrest
+            lines = [
+                f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.force_pairs
+            ]
+            lines += cell.motion_texts
             offset = 0.12 * len(lines)
             axes.text(
                 x,

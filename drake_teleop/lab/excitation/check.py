@@ -18,9 +18,9 @@ from drake_teleop.load.trajectory import FourierTrajectory
 CHECK_RATE_HZ = 1000.0
 _SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration")
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
-_STEP_S = 1e-4
+_DIFFERENCE_STEP_S = 1e-4
 # Search distance beyond the clearance [m].
-_SEARCH_MARGIN_M = 0.01
+_CLEARANCE_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -28,19 +28,19 @@ class LimitUse:
     """Largest use of one limit by a motion.
 
     Attributes:
-        share: largest |value| over the limit; above 1 violates the limit.
-        time: time of this value [s].
-        what: joint, axis or pair of shapes with this value.
+        used_share: largest |value| over the limit; above 1 violates the limit.
+        time_s: time of this value [s].
+        where: joint, axis or pair of shapes with this value.
     """
 
-    limit: str
-    share: float
-    time: float
-    what: str
+    limit_name: str
+    used_share: float
+    time_s: float
+    where: str
 
     def __str__(self) -> str:
-        share = f"{self.share:.1%}" if np.isfinite(self.share) else "more than all"
-        return f"{share} of the {self.limit} limit ({self.what}, at {self.time:.3f} s)"
+        share = f"{self.used_share:.1%}" if np.isfinite(self.used_share) else "more than all"
+        return f"{share} of the {self.limit_name} limit ({self.where}, at {self.time_s:.3f} s)"
 
 
 def check_trajectory(
@@ -50,8 +50,13 @@ def check_trajectory(
 ) -> list[LimitUse]:
     """Return the use of every limit in one period of a trajectory, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * CHECK_RATE_HZ) + 1)
-    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
-    qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
+    before, q, after = (
+        trajectory.evaluate(t + step)[0] for step in (-_DIFFERENCE_STEP_S, 0.0, _DIFFERENCE_STEP_S)
+    )
+    qd, qdd = (
+        (after - before) / (2 * _DIFFERENCE_STEP_S),
+        (after - 2 * q + before) / _DIFFERENCE_STEP_S**2,
+    )
     return check_motion(robot, t, q, qd, qdd, progress)
 
 
@@ -65,20 +70,22 @@ def check_motion(
 ) -> list[LimitUse]:
     """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
     names, limits = robot.arm.joint_names, robot.limits
-    motion = _evaluate_motion(robot, q, qd, qdd, progress)
+    torque, sensor, workspace, clearance, nearest = _evaluate_motion(robot, q, qd, qdd, progress)
     uses = [
         _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
         _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
         _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _largest_use("torque", np.abs(motion.torque) / limits.effort, t, names),
-        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORM_NAMES),
-        _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
+        _largest_use("torque", np.abs(torque) / limits.max_torques, t, names),
+        _largest_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
+        _largest_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_use("clearance", clearance[:, np.newaxis], t, ("",)),
     ]
-    uses[-1] = replace(uses[-1], what=motion.nearest[int(np.argmax(motion.clearance))])
+    uses[-1] = replace(uses[-1], where=nearest[int(np.argmax(clearance))])
     without_end = {"position": limits.q_half, "workspace": limits.box_half}
     missing = [name for name, half in without_end.items() if np.isinf(half).all()]
-    return sorted((use for use in uses if use.limit not in missing), key=lambda use: -use.share)
+    return sorted(
+        (use for use in uses if use.limit_name not in missing), key=lambda use: -use.used_share
+    )
 
 
 def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> LimitUse:
@@ -86,18 +93,10 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
     return LimitUse(limit, float(shares[when, which]), float(t[when]), names[which])
 
 
-@dataclass(frozen=True)
-class _MotionSamples:
-    torque: Array
-    sensor: Array
-    workspace: Array
-    clearance: Array  #: required over actual distance
-    nearest: list[str]
-
-
 def _evaluate_motion(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
-) -> _MotionSamples:
+) -> tuple[Array, Array, Array, Array, list[str]]:
+    # Joint torques, sensor norms, uses of workspace and clearance, nearest shapes.
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
@@ -128,14 +127,16 @@ def _evaluate_motion(
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = robot.scene_graph.get_query_output_port().Eval(scene_context)
-        distance, words = _nearest_obstacle(robot, query, limits.clearance + _SEARCH_MARGIN_M)
+        distance, words = _nearest_shape_pair(
+            robot, query, limits.clearance + _CLEARANCE_SEARCH_MARGIN_M
+        )
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
             progress(k / len(q))
     progress(1.0)
     sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
-    return _MotionSamples(torque, sensor, workspace, clearance, nearest)
+    return torque, sensor, workspace, clearance, nearest
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
@@ -154,7 +155,7 @@ def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     return found[1:]
 
 
-def _nearest_obstacle(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
+def _nearest_shape_pair(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"

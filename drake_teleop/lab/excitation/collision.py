@@ -112,20 +112,20 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
-_NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
+_NEIGHBOUR_SHARE, _MIN_DISTANCE_VARIATION_M = 0.95, 1e-3
 # Number of postures that show which shapes remain at a constant distance.
-_NUM_FIRST_POSTURES = 20
+_NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
 _CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
 # Smallest number of postures near contact for a correction.
-_MIN_POSTURES = 5
+_MIN_NEAR_POSTURES = 5
 # Share of postures below which near capsules count although their shapes were never near.
 _RARE_SHARE = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
-_PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_HALF_SPACE_BOX, _HALF_SPACE_BOX_POSE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
 _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
@@ -134,7 +134,7 @@ _ShapePair = tuple[GeometryId, GeometryId]
 ParseArm = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
 
 
-class Scene:
+class CollisionScene:
     """Plant and scene graph of the arm with its heaviest load.
 
     Args:
@@ -149,21 +149,17 @@ class Scene:
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
-        _add_solid_shapes(self.plant, self.scene_graph, visuals_count)
+        _complete_collision_shapes(self.plant, self.scene_graph, visuals_count)
         _check_shape_sizes(self.plant, self.scene_graph, where)
         _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE_NAME)
         finalize_plant(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
-        self._rows = self._find_link_rows()
-
-    def _find_link_rows(self) -> dict[BodyIndex, int]:
-        rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
+        self._rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
             for body in self.plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
-                rows[body] = row
-        return rows
+                self._rows[body] = row
 
     def find_collision_candidates(
         self, postures: Array, start: Array | None
@@ -194,7 +190,7 @@ class Scene:
             query = self.scene_graph.get_query_output_port().Eval(scene_context)
             for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
-            if k + 1 == _NUM_FIRST_POSTURES:
+            if k + 1 == _NUM_COAXIALITY_POSTURES:
                 in_context = self.scene_graph.collision_filter_manager(scene_context)
                 _exclude_coaxial(in_context, distances)
         # A new manager: declarations of a manager older than the context have no effect there.
@@ -202,21 +198,18 @@ class Scene:
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
-            constant = of_pair.max() < of_pair.min() + _MIN_VARIATION_M
+            constant = of_pair.max() < of_pair.min() + _MIN_DISTANCE_VARIATION_M
             neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_SHARE
             touch = start is not None and of_all[-1] < CLEARANCE_M
             if touch and not neighbours:
-                touching.append(" and ".join(self._body_names(a, b)))
+                frames = map(self.scene_graph.model_inspector().GetFrameId, (a, b))
+                names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+                touching.append(" and ".join(names))
             if touch or neighbours:
                 exclude = CollisionFilterDeclaration().ExcludeBetween
                 manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
                 del distances[a, b]
         return distances, sorted(set(touching))
-
-    def _body_names(self, *shapes: GeometryId) -> list[str]:
-        inspector = self.scene_graph.model_inspector()
-        frames = map(inspector.GetFrameId, shapes)
-        return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
     def bounding_capsules(
         self, candidates: dict[_ShapePair, Array], postures: Array
@@ -235,12 +228,12 @@ class Scene:
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
-            X_LB = X_WB if row < 0 else _transform_of_motion(motions[0, row]).InvertAndCompose(X_WB)
+            X_LB = X_WB if row < 0 else _pose_of_link_motion(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
-        outer = {shape: _outermost_capsule(shape, capsules) for shape in capsules}
+        outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
         outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
@@ -258,10 +251,10 @@ class Scene:
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _minimum_distance(shape_distances[a, b], capsules_apart[:, k])
+            distance = _required_distance(shape_distances[a, b], capsules_apart[:, k])
             near = shape_distances[a, b] < CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
-            if near.sum() >= _MIN_POSTURES:
+            if near.sum() >= _MIN_NEAR_POSTURES:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
                 useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_SHARE
@@ -271,11 +264,13 @@ class Scene:
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _required_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (
-        (of_shapes - capsules_apart)[touching] if touching.sum() >= _MIN_POSTURES else np.zeros(1)
+        (of_shapes - capsules_apart)[touching]
+        if touching.sum() >= _MIN_NEAR_POSTURES
+        else np.zeros(1)
     )
     free = capsules_apart[of_shapes > CLEARANCE_M]
     return float(
@@ -286,8 +281,8 @@ def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
 def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_ShapePair, Array]) -> None:
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
-        first = of_pair[:_NUM_FIRST_POSTURES]
-        if first.max() < min(CLEARANCE_M, first.min() + _MIN_VARIATION_M):
+        first = of_pair[:_NUM_COAXIALITY_POSTURES]
+        if first.max() < min(CLEARANCE_M, first.min() + _MIN_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
@@ -297,7 +292,7 @@ def _identifier_number(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
-def _outermost_capsule(
+def _shape_with_enclosing_capsule(
     shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
 ) -> GeometryId:
     row, capsule = capsules[shape]
@@ -309,7 +304,7 @@ def _outermost_capsule(
     return max(holding, key=lambda entry: entry[:2])[2]
 
 
-def _transform_of_motion(motion: Array) -> RigidTransform:
+def _pose_of_link_motion(motion: Array) -> RigidTransform:
     return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 
@@ -326,7 +321,9 @@ def _add_load(
     )
 
 
-def _add_solid_shapes(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
+def _complete_collision_shapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool
+) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
@@ -364,5 +361,5 @@ def _add_shape(
     plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
 ) -> None:
     if isinstance(shape, HalfSpace):
-        X_BG, shape = X_BG @ _X_PLANE_PLATE, _PLATE
+        X_BG, shape = X_BG @ _HALF_SPACE_BOX_POSE, _HALF_SPACE_BOX
     plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())

@@ -25,9 +25,9 @@ CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 #: Sample rate of A16 and D16 [Hz].
 SAMPLE_RATE_HZ = 1000.0
 
-# Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
-# [N], [N m].
-_MASS_ERROR, _COM_ERROR_M, _INERTIA_ERROR = 0.01, 1e-3, 0.1
+# Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
+_MASS_ERROR, _INERTIA_ERROR = 0.01, 0.1
+_COM_ERROR_M = 1e-3
 _OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
 _MIN_EIGENVALUE_RATIO = 1e-13
@@ -75,7 +75,7 @@ class Criterion:
             columns = _acceptable_errors(scales.phi)
         self._columns = columns
 
-    def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
+    def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
         """Return the scaled regressor (6 T, c) and the information matrix (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
@@ -85,7 +85,7 @@ class Criterion:
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
         """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
-        _, gram = self.information(s, omega, alpha)
+        _, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
@@ -98,7 +98,7 @@ class Criterion:
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
         """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
-        rows, gram = self.information(s, omega, alpha)
+        rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
@@ -127,7 +127,7 @@ class Criterion:
 
 
 @njit(cache=True)
-def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
+def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
     """Write gradients (3,) of a scalar by s, omega, alpha, from that by the regressor V (6, 10)."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]

@@ -20,7 +20,12 @@ from drake_teleop.lab.excitation.limits import (
     write_link_motions,
     write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, minimise_criterion
+from drake_teleop.lab.excitation.optimizer import (
+    DesignProblem,
+    DesignTask,
+    Iterate,
+    minimise_criterion,
+)
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -28,9 +33,9 @@ from drake_teleop.load.trajectory import FourierTrajectory
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
-_CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
+_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKS = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
-_SMALL_FACTORS, _NUM_SMALL = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
+_FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
 _CONVEX_HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
     " touch in its start posture are ignored"
@@ -74,7 +79,7 @@ def excite(
 
     `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
-    task = Task(
+    task = DesignTask(
         robot.arm.table,
         robot.limits,
         Criterion(criterion, robot.scales),
@@ -88,37 +93,40 @@ def excite(
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        problem = Problem(task)
+        problem = DesignProblem(task)
         found = minimise_criterion(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
-        report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
+        report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
         small = _shrinking_motions_at_start(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
-    return make_checked_excitation(robot, criterion, found, trajectory, uses)
+    return assemble_excitation(robot, criterion, found, trajectory, uses)
 
 
-def make_checked_excitation(
+def assemble_excitation(
     robot: Robot,
     criterion: str,
     found: list[Iterate],
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
-    best = accumulate((iterate.value for iterate in found), min)
+    best = accumulate((iterate.criterion_value for iterate in found), min)
     return Excitation(
         robot,
         trajectory,
         criterion,
         criterion_values(robot, trajectory),
         predicted_deviations(
-            *sensor_motion(robot, trajectory), 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi
+            *sensor_motion(robot, trajectory),
+            1 / CHECK_RATE_HZ,
+            robot.noise,
+            robot.limits.heaviest_phi,
         ),
         uses,
-        np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]).reshape(
-            -1, 2
-        ),
-        found[-1].seconds if found else 0.0,
+        np.array(
+            [(it.num_evaluations, value) for it, value in zip(found, best, strict=True)]
+        ).reshape(-1, 2),
+        found[-1].cpu_time_s if found else 0.0,
     )
 
 
@@ -135,16 +143,16 @@ def find_best_within_limits(
     worst: LimitUse | None = None
     for trajectory in chain(_feasible_candidates(found, robot), others):
         uses = check_trajectory(robot, trajectory, progress)
-        if uses[0].share <= 1:
+        if uses[0].used_share <= 1:
             return trajectory, uses
-        if worst is None or uses[0].share < worst.share:
+        if worst is None or uses[0].used_share < worst.used_share:
             worst = uses[0]
     raise DrakeTeleopError(
         "no trajectory was found that respects all limits"
         + (f": the best uses {worst}" if worst else ""),
         where=robot.name,
         remedy="take more time, a longer period or another seed"
-        + (_CONVEX_HULL_ADVICE if worst is not None and worst.limit == "clearance" else ""),
+        + (_CONVEX_HULL_ADVICE if worst is not None and worst.limit_name == "clearance" else ""),
     )
 
 
@@ -168,13 +176,13 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 
 
 def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    ranked = sorted(found, key=lambda iterate: iterate.value)
-    last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
+    ranked = sorted(found, key=lambda iterate: iterate.criterion_value)
+    last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
     checks = 0
     for iterate in ranked:
-        if iterate.value < _CANDIDATE_RATIO * last[iterate.start]:
+        if iterate.criterion_value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start_index]:
             continue
-        last[iterate.start] = iterate.value
+        last[iterate.start_index] = iterate.criterion_value
         for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_limit_uses(robot, trajectory).max() <= 1:
@@ -186,14 +194,14 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
 
 
 def _shrinking_motions_at_start(
-    robot: Robot, found: list[Iterate], problem: Problem, seed: int
+    robot: Robot, found: list[Iterate], problem: DesignProblem, seed: int
 ) -> Iterator[FourierTrajectory]:
-    best = sorted(found, key=lambda iterate: iterate.value)[:_NUM_SMALL]
+    best = sorted(found, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
     rng = np.random.default_rng(seed)
-    random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_SMALL))
+    random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_FALLBACK_MOTIONS))
     motions += [problem.trajectory(x) for x in random]
-    for factor in _SMALL_FACTORS:
+    for factor in _FALLBACK_AMPLITUDE_FACTORS:
         for motion in motions:
             small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
             # The last use is that of capsules; `check_trajectory` measures the true clearance.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.criteria import regressor_gradient
+from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,
     add_point_to_seed,
@@ -26,7 +26,7 @@ from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, inverse_dynamics,
 LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
-CLEARANCE_SCALE_M = 0.1
+ZERO_USE_CLEARANCE_MARGIN_M = 0.1
 # Smallest weight in the gradient of a smooth maximum.
 _MIN_GRADIENT_WEIGHT = 1e-7
 # Value that replaces all distances above clearance plus scale [m].
@@ -38,16 +38,17 @@ class Limits(NamedTuple):
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
-        velocity, acceleration, effort: (n,) joint limits [rad/s], [rad/s^2], [N m]; may be inf.
-        phi: (10,) heaviest expected load about the origin of S.
-        sensor: (4,) largest norms of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
+        velocity, acceleration: (n,) joint limits [rad/s], [rad/s^2]; may be inf.
+        max_torques: (n,) joint limits [N m]; may be inf.
+        heaviest_phi: (10,) heaviest expected load about the origin of S.
+        max_sensor_norms: (4,) of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
         points_S: (P, 3) points in S that remain in the box [m].
         box_middle, box_half: (3,) middle and half size of the box in W [m]; half may be inf.
-        capsule_row: (C,) link of each capsule, a row of `link_motions`; -1 is the world.
+        capsule_links: (C,) link of each capsule, a row of `link_motions`; -1 is the world.
         capsule_ends: (C, 2, 3) end points of each capsule in the link's frame [m].
         capsule_radius: (C,) radii [m].
-        pairs: (K, 2) pairs of capsules with a minimum distance.
-        distances: (K,) these distances [m], possibly negative.
+        capsule_pairs: (K, 2) pairs of capsules with a minimum distance.
+        min_pair_distances: (K,) these distances [m], possibly negative.
         clearance: minimum distance of the true shapes [m].
     """
 
@@ -55,21 +56,21 @@ class Limits(NamedTuple):
     q_half: Array
     velocity: Array
     acceleration: Array
-    effort: Array
-    phi: Array
-    sensor: Array
+    max_torques: Array
+    heaviest_phi: Array
+    max_sensor_norms: Array
     points_S: Array
     box_middle: Array
     box_half: Array
-    capsule_row: NDArray[np.int64]
+    capsule_links: NDArray[np.int64]
     capsule_ends: Array
     capsule_radius: Array
-    pairs: NDArray[np.int64]
-    distances: Array
+    capsule_pairs: NDArray[np.int64]
+    min_pair_distances: Array
     clearance: float
 
 
-def half_ranges_for_sampling(q_half: Array) -> Array:
+def finite_half_ranges(q_half: Array) -> Array:
     """Return the half ranges (n,) for random postures [rad]: pi without limits."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
@@ -101,7 +102,7 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
     for t in range(len(motions)):
         motion = motions[t, -1]
         omega = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
-        regressor_gradient(omega, g_V[t], g[0], g[1], g[2])
+        write_gradients_by_motion(omega, g_V[t], g[0], g[1], g[2])
         seeds[-1] = 0.0
         for k in range(3):
             add_vector_to_seed(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
@@ -176,23 +177,23 @@ def _write_torque_use(
     for t in range(T):
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):
-            use[t, j] = abs(tau[t, j]) / limits.effort[j]
+            use[t, j] = abs(tau[t, j]) / limits.max_torques[j]
     largest[3], smooth[3] = _smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for j in range(n):
-            c[j] = use[t, j] * np.sign(tau[t, j]) / limits.effort[j]
+            c[j] = use[t, j] * np.sign(tau[t, j]) / limits.max_torques[j]
             # Table columns 22 and 23: rotor inertia and joint damping.
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
         add_torque_to_seeds(table, motions[t], c, virtual, seeds)
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
+def _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
     pull_back_seeds(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
@@ -212,11 +213,11 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
         x[t, 6], x[t, 7], x[t, 8] = rotate_to_link(motion, (motion[0], motion[1], motion[2]))
         x[t, 9], x[t, 10], x[t, 11] = rotate_to_link(motion, (motion[6], motion[7], motion[8]))
         omega[0], omega[1], omega[2] = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
-        non_contact_wrench_into(x[t, 6:9], omega, x[t, 9:12], limits.phi, x[t, :6])
+        non_contact_wrench_into(x[t, 6:9], omega, x[t, 9:12], limits.heaviest_phi, x[t, :6])
         for k in range(4):
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
             size[t, k] = np.sqrt(a * a + b * b + c * c)
-            use[t, k] = size[t, k] / limits.sensor[k]
+            use[t, k] = size[t, k] / limits.max_sensor_norms[k]
     largest[4], smooth[4] = _smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
@@ -224,15 +225,15 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
             continue
         seeds[:] = 0.0
         for k in range(4):
-            factor = use[t, k] / (limits.sensor[k] * max(size[t, k], 1e-12))
+            factor = use[t, k] / (limits.max_sensor_norms[k] * max(size[t, k], 1e-12))
             for i in range(3):
                 g[k, i] = factor * x[t, 3 * k + i]
         motion = motions[t, -1]
         force, torque = (g[0, 0], g[0, 1], g[0, 2]), (g[1, 0], g[1, 1], g[1, 2])
-        add_wrench_to_seed(motion, limits.phi, force, torque, seeds[-1])
+        add_wrench_to_seed(motion, limits.heaviest_phi, force, torque, seeds[-1])
         add_vector_to_seed(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
         add_vector_to_seed(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -263,7 +264,7 @@ def _write_workspace_use(
                 use[t, i + 2] * sign[t, i + 2],
             )
             add_point_to_seed(motions[t, -1], limits.points_S[k], g, seeds[-1])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -271,21 +272,23 @@ def _write_clearance_use(
     table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
 ):
     seeds = work[0]
-    T, K = len(motions), len(limits.pairs)
+    T, K = len(motions), len(limits.capsule_pairs)
     if K == 0:
         largest[6] = smooth[6] = 0.0
         return
     use, nearest = np.empty((T, K)), np.empty(5)
     ends = np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
-        _transform_capsules(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
+        _transform_capsules(motions[t], limits.capsule_links, limits.capsule_ends, ends[t])
         for k in range(K):
-            a, b = limits.pairs[k]
+            a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
             distance = _FAR_DISTANCE_M
-            if not _is_farther_apart(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE_M):
+            if not _is_farther_apart(ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M):
                 distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
-            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE_M
+            use[t, k] = (
+                1.0 - (distance - limits.min_pair_distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
+            )
     largest[6], smooth[6] = _smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_GRADIENT_WEIGHT:
@@ -294,21 +297,21 @@ def _write_clearance_use(
         for k in range(K):
             if use[t, k] < _MIN_GRADIENT_WEIGHT:
                 continue
-            a, b = limits.pairs[k]
+            a, b = limits.capsule_pairs[k]
             _segment_distance(ends[t, a], ends[t, b], nearest)
             for side in range(2):
-                capsule = limits.pairs[k, side]
-                row = limits.capsule_row[capsule]
+                capsule = limits.capsule_pairs[k, side]
+                row = limits.capsule_links[capsule]
                 if row < 0:
                     continue
                 along, towards = nearest[side], (1.0 if side == 0 else -1.0)
-                factor = -use[t, k] / CLEARANCE_SCALE_M * towards
+                factor = -use[t, k] / ZERO_USE_CLEARANCE_MARGIN_M * towards
                 point = limits.capsule_ends[capsule, 0] + along * (
                     limits.capsule_ends[capsule, 1] - limits.capsule_ends[capsule, 0]
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 add_point_to_seed(motions[t, row], point, g, seeds[row])
-        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)

@@ -19,7 +19,7 @@ from drake_teleop.lab.excitation.limits import (
     Limits,
     criterion_gradient,
     empty_motions,
-    half_ranges_for_sampling,
+    finite_half_ranges,
     write_limit_uses,
     write_link_motions,
     write_sensor_motion,
@@ -36,22 +36,22 @@ _RANDOM_MOTION_SHARE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class DesignTask:
     """Specification of a trajectory design.
 
     Args:
-        table: `ArmModel.table`, with the heaviest load.
-        home: (n,) posture around which half of the candidates are drawn [rad].
-        period: duration of the trajectory [s].
-        harmonics: number N of harmonics in Eq. (9), at least 2.
+        arm_table: `ArmModel.table`, with the heaviest load.
+        home_posture: (n,) posture around which half of the candidates are drawn [rad].
+        period_s: duration of the trajectory [s].
+        num_harmonics: number N of harmonics in Eq. (9), at least 2.
     """
 
-    table: Array
+    arm_table: Array
     limits: Limits
     criterion: Criterion
-    home: Array
-    period: float
-    harmonics: int
+    home_posture: Array
+    period_s: float
+    num_harmonics: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,48 +62,51 @@ class Evaluation:
         log_criterion: smooth logarithm of the criterion.
         uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
         gradients: (8, unknowns) gradients of criterion (first) and uses.
-        largest_use: exact largest use of any limit.
+        largest_limit_use: exact largest use of any limit.
     """
 
     log_criterion: float
     uses: Array
     gradients: Array
-    largest_use: float
+    largest_limit_use: float
 
 
-class Problem:
+class DesignProblem:
     """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: DesignTask) -> None:
         self.task = task
-        n, free = len(task.home), 2 * (task.harmonics - 1)
-        samples = _SAMPLES_PER_HARMONIC * task.harmonics
+        n, free = len(task.home_posture), 2 * (task.num_harmonics - 1)
+        samples = _SAMPLES_PER_HARMONIC * task.num_harmonics
         unit = np.eye(free)
         basis = FourierTrajectory.at_rest(
-            np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period
+            np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period_s
         )
         #: (3, T, free): q, qd, qdd of unit coefficients.
-        self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period / samples))
+        self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period_s / samples))
         self._motions = empty_motions(samples, n)
         self._vectors = np.empty((3, samples, 3))
         self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        n = len(self.task.home)
+        n = len(self.task.home_posture)
         sine, cosine = x[n:].reshape(2, n, -1)
-        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
+        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return the unknowns of a random motion, near or far from the home posture."""
         task, limits = self.task, self.task.limits
-        rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
+        rate = 2 * np.pi / task.period_s * np.sqrt(task.num_harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
         spread = np.tile(
-            np.repeat(_RANDOM_MOTION_SHARE * np.minimum(size, limits.q_half), task.harmonics - 1), 2
+            np.repeat(
+                _RANDOM_MOTION_SHARE * np.minimum(size, limits.q_half), task.num_harmonics - 1
+            ),
+            2,
         )
-        q0 = task.home + 0.1 * rng.standard_normal(len(size))
+        q0 = task.home_posture + 0.1 * rng.standard_normal(len(size))
         if not near_home:
-            half = half_ranges_for_sampling(limits.q_half)
+            half = finite_half_ranges(limits.q_half)
             q0 = limits.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
@@ -112,19 +115,21 @@ class Problem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        task, n = self.task, len(self.task.home)
+        task, n = self.task, len(self.task.home_posture)
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         joints = self._basis @ coefficients
         joints[0] += x[:n]
-        write_link_motions(task.table, *joints, self._motions)
+        write_link_motions(task.arm_table, *joints, self._motions)
         write_sensor_motion(self._motions, self._vectors)
         self._gradients[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = task.criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
+        criterion_gradient(
+            task.arm_table, self._motions, joints[1], joints[2], g_V, self._gradients[0]
+        )
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
-            task.table, *joints, self._motions, task.limits, limit_sharpness,
+            task.arm_table, *joints, self._motions, task.limits, limit_sharpness,
             smooth, largest, self._gradients[1:],
         )  # fmt: skip
         return Evaluation(value, smooth, self._gradients_by_unknowns(), float(largest.max()))
@@ -132,7 +137,7 @@ class Problem:
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""
         s, omega, alpha = self._vectors
-        return self.task.criterion.value(s, omega, alpha, self.task.period)
+        return self.task.criterion.value(s, omega, alpha, self.task.period_s)
 
     def _gradients_by_unknowns(self) -> Array:
         g = self._gradients
@@ -147,12 +152,12 @@ class Problem:
 
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
-LIMIT_SHARE = 0.985
+USABLE_LIMIT_SHARE = 0.985
 # Largest use of a feasible iterate on the grid.
 _MAX_FEASIBLE_USE = 0.9885
 
 # Number of candidates in a batch, and number of them from which a descent starts.
-_NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
+_NUM_CANDIDATES, _NUM_DESCENT_STARTS = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
@@ -167,17 +172,17 @@ _MIN_IMPROVEMENT = 0.995
 
 @dataclass(frozen=True)
 class Iterate:
-    """Feasible trajectory, found after `seconds` of thread CPU time."""
+    """Feasible trajectory, found after `cpu_time_s` of thread CPU time."""
 
-    seconds: float
-    evaluations: int
-    start: int
-    value: float
+    cpu_time_s: float
+    num_evaluations: int
+    start_index: int
+    criterion_value: float
     trajectory: FourierTrajectory
 
 
 def minimise_criterion(
-    problem: Problem,
+    problem: DesignProblem,
     *,
     seed: int,
     starts: int = 4,
@@ -208,7 +213,7 @@ class _InfeasibleStartError(Exception): ...
 class _DescentSearch:
     def __init__(
         self,
-        problem: Problem,
+        problem: DesignProblem,
         starts: int,
         seconds: float | None,
         progress: Callable[[float, float], None],
@@ -239,7 +244,7 @@ class _DescentSearch:
                 self._count_evaluation()
                 point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
                 merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
-            for k in np.argsort(merit)[:_NUM_FOLLOWED]:
+            for k in np.argsort(merit)[:_NUM_DESCENT_STARTS]:
                 yield batch[k]
 
     def descend_from(self, x: Array) -> None:
@@ -273,7 +278,9 @@ class _DescentSearch:
             bounds=self._problem.bounds(x),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, *sharpness: LIMIT_SHARE - self._evaluate_once(x, *sharpness).uses,
+                "fun": lambda x, *sharpness: (
+                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).uses
+                ),
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (criterion_sharpness, limit_sharpness),
             },
@@ -285,7 +292,7 @@ class _DescentSearch:
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
-        excess = np.maximum(point.uses - LIMIT_SHARE, 0)
+        excess = np.maximum(point.uses - USABLE_LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
@@ -297,7 +304,7 @@ class _DescentSearch:
             self._count_evaluation()
             self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
-            if self._last.largest_use <= _MAX_FEASIBLE_USE:
+            if self._last.largest_limit_use <= _MAX_FEASIBLE_USE:
                 self._record_iterate(x)
             elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
                 "inf"

@@ -24,19 +24,19 @@ class SensorNoise(NamedTuple):
     """Noise of the 12 channels [f, tau, s, alpha] and its filters.
 
     Attributes:
-        weights: (6,) standard deviations by which the estimator divides the wrench [N, N m].
-        white: (12,) two-sided spectral densities of white noise [unit^2 s].
-        walk: (12,) random walks: variance per second [unit^2 / s].
-        place: (3,) position p_SoAo_S of the accelerometer [m].
-        filters: transfer functions (numerator, denominator) from the noise of s and of alpha to the
-            estimates; None without accelerometer.
+        assumed_wrench_std: (6,) deviations by which the estimator divides the wrench [N, N m].
+        white_noise_densities: (12,) two-sided spectral densities of white noise [unit^2 s].
+        random_walk_variances: (12,) random walks: variance per second [unit^2 / s].
+        p_SoAo_S: (3,) position of the accelerometer [m].
+        motion_error_filters: transfer functions (numerator, denominator) from the noise of s
+            and of alpha to the estimates; None without accelerometer.
     """
 
-    weights: Array
-    white: Array
-    walk: Array
-    place: Array
-    filters: tuple[tuple[Array, Array], tuple[Array, Array]] | None
+    assumed_wrench_std: Array
+    white_noise_densities: Array
+    random_walk_variances: Array
+    p_SoAo_S: Array
+    motion_error_filters: tuple[tuple[Array, Array], tuple[Array, Array]] | None
 
 
 def sensor_noise(
@@ -50,7 +50,7 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = fusion_gains(estimation, sensor, num_joints, period)
-        filters = _error_filter(linear, period), _error_filter(angular, period)
+        filters = _motion_error_filter(linear, period), _motion_error_filter(angular, period)
     place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -66,25 +66,25 @@ def predicted_covariance(
 ) -> Array:
     """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
-    weighted = rows / noise.weights[:, np.newaxis] ** 2
+    weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)
     # Balance before inversion: the columns have different units.
     size = np.sqrt(np.diag(gram))
     inverse = np.linalg.inv(gram / np.outer(size, size)) / np.outer(size, size)
     influence = np.zeros((len(s), 12, 16))
     influence[:, :6] = weighted @ inverse
-    if noise.filters is not None:
-        of_s, of_alpha = noise.filters
-        of_motion = -spatial_inertia(phi) @ influence[:, :6]
+    if noise.motion_error_filters is not None:
+        of_s, of_alpha = noise.motion_error_filters
+        of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
         through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
-        through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
+        through_alpha = of_motion[:, 3:] + cross_matrix(noise.p_SoAo_S).T @ through_s
         influence[:, 6:9] = through_s
         influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
-    of_white = _covariance_of_influence(influence, noise.white) / step
-    return of_white + _covariance_of_influence(later, noise.walk) * step
+    of_white = _covariance_of_influence(influence, noise.white_noise_densities) / step
+    return of_white + _covariance_of_influence(later, noise.random_walk_variances) * step
 
 
 def _covariance_of_influence(influence: Array, variances: Array) -> Array:
@@ -92,7 +92,7 @@ def _covariance_of_influence(influence: Array, variances: Array) -> Array:
     return rows.T @ rows
 
 
-def _error_filter(gains: Array, period: float) -> tuple[Array, Array]:
+def _motion_error_filter(gains: Array, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
@@ -106,7 +106,7 @@ def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: fl
     return np.asarray(lfilter(b, a, signals[::-1], axis=0)[::-1])
 
 
-def spatial_inertia(phi: Array) -> Array:
+def spatial_inertia_matrix(phi: Array) -> Array:
     """Return the matrix (6, 6) from [s, alpha] of the sensor to the wrench of a load phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])

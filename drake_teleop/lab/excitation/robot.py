@@ -15,9 +15,9 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import CLEARANCE_M, ParseArm, Scene
+from drake_teleop.lab.excitation.collision import CLEARANCE_M, CollisionScene
 from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
-from drake_teleop.lab.excitation.limits import Limits, half_ranges_for_sampling
+from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
@@ -34,13 +34,13 @@ from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_POSTURES = 1000  # random postures for distances of shapes
+_NUM_RANDOM_POSTURES = 1000  # random postures for distances of shapes
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_LOAD_FACTOR = 1.3
+_HEAVIEST_LOAD_RATIO = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _PAYLOAD_COM_M, _PAYLOAD_GYRATION_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
@@ -74,7 +74,7 @@ class Robot:
     noise: SensorNoise
     home: Array
     assumptions: tuple[str, ...]
-    folders: tuple[TemporaryDirectory[str], ...] = ()
+    temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
@@ -90,7 +90,9 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
     own = scenario.slave.model != ""
-    scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
+    scene = CollisionScene(
+        parse, (_HEAVIEST_LOAD_RATIO - 1) * slave.arm.phi_load, visuals_count=not own
+    )
     scene.arm, _ = fill_missing_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
@@ -133,11 +135,14 @@ def RobotFromModel(
 
     assumptions = ["a table at z = 0"]
     with translate_drake_errors(path):
-        arm = _read_arm(parse)
+        plant = MultibodyPlant(0.0)
+        instance, frame = parse(plant)
+        finalize_plant(plant)
+        arm = ArmModelFromPlant(plant, instance, frame.name())
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_LOAD_FACTOR - 1) * load
+        reserve = (_HEAVIEST_LOAD_RATIO - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -154,9 +159,11 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the total mass beyond the sensor, or remove the option",
             )
-        reserve = _make_compact_load(mass - load[0])
+        missing_mass, com = mass - load[0], np.array([0.0, 0.0, _PAYLOAD_COM_M])
+        inertia = missing_mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3
+        reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
-        scene = Scene(parse, reserve, visuals_count=False, where=str(path))
+        scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
     scene.arm, completed = fill_missing_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
@@ -176,7 +183,7 @@ def RobotFromModel(
 
 
 def _make_robot(
-    scene: Scene,
+    scene: CollisionScene,
     name: str,
     sensor: WristSensorConfig,
     estimation: MotionEstimationConfig,
@@ -190,8 +197,8 @@ def _make_robot(
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
-    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
-    postures = middle + half_ranges_for_sampling(half) * random
+    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_RANDOM_POSTURES, len(half)))
+    postures = middle + finite_half_ranges(half) * random
     candidates, touching = scene.find_collision_candidates(postures, start)
     if touching:
         assumptions.append(
@@ -207,17 +214,17 @@ def _make_robot(
         q_half=_JOINT_LIMIT_SHARE * half,
         velocity=_JOINT_LIMIT_SHARE * arm.velocity_limit,
         acceleration=arm.acceleration_limit,
-        effort=_JOINT_LIMIT_SHARE * arm.effort_limit,
-        phi=phi,
-        sensor=np.array([force, torque, sensor.acceleration_range, alpha]),
+        max_torques=_JOINT_LIMIT_SHARE * arm.effort_limit,
+        heaviest_phi=phi,
+        max_sensor_norms=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
-        capsule_row=rows,
+        capsule_links=rows,
         capsule_ends=ends,
         capsule_radius=radii,
-        pairs=pairs,
-        distances=distances,
+        capsule_pairs=pairs,
+        min_pair_distances=distances,
         clearance=CLEARANCE_M,
     )
     return Robot(
@@ -232,17 +239,5 @@ def _make_robot(
         noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home=middle if start is None else start,
         assumptions=tuple(assumptions),
-        folders=tuple(folders),
+        temporary_folders=tuple(folders),
     )
-
-
-def _read_arm(parse: ParseArm) -> ArmModel:
-    plant = MultibodyPlant(0.0)
-    instance, frame = parse(plant)
-    finalize_plant(plant)
-    return ArmModelFromPlant(plant, instance, frame.name())
-
-
-def _make_compact_load(mass: float) -> Array:
-    com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
-    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

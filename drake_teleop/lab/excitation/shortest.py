@@ -22,8 +22,8 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import (
     Excitation,
+    assemble_excitation,
     find_best_within_limits,
-    make_checked_excitation,
     sensor_motion,
 )
 from drake_teleop.lab.excitation.limits import (
@@ -35,15 +35,15 @@ from drake_teleop.lab.excitation.limits import (
 )
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
+    DesignProblem,
+    DesignTask,
     Evaluation,
-    Problem,
-    Task,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
-    spatial_inertia,
+    spatial_inertia_matrix,
 )
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
@@ -60,13 +60,14 @@ RELIABLE_PROBABILITY = 0.95
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
 _MAX_LOG_PERIOD_STEP = 0.15
-# Largest number of rounds; number of successful rounds without progress; required progress factor;
-# additional margin after a round that missed the tolerance.
-_MAX_ROUNDS, _MAX_VAIN_ROUNDS, _PROGRESS_RATIO, _FACTOR_MARGIN = 20, 1, 0.99, 1.005
+# Largest number of rounds; number of successful rounds without progress; required progress factor.
+_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO = 20, 1, 0.99
+# Additional margin after a round that missed the tolerance.
+_FACTOR_MARGIN_AFTER_MISS = 1.005
 # Number of rounds without any motion before the search fails.
-_MAX_EMPTY_ROUNDS = 3
+_MAX_ROUNDS_WITHOUT_MOTION = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.
-_MAX_START_MISFIT, _NUM_LATER_STARTS = 1.5, 4
+_MAX_MISFIT_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 # Difference between the seeds of rounds.
 _SEED_STEP = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
@@ -79,10 +80,10 @@ _REGULARISATION = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class ShortestMotion:
-    """Checked motion; `reached` (k,): predicted errors over tolerances, at most 1."""
+    """Checked motion; `errors_over_tolerances` (k,) are predicted errors, at most 1."""
 
     excitation: Excitation
-    reached: Array
+    errors_over_tolerances: Array
 
 
 def design_shortest_motion(
@@ -99,49 +100,53 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * sidak_factor(
+    errors = derivatives_over_tolerances(tolerance, robot.limits.heaviest_phi) * sidak_factor(
         len(tolerance.required_entry_names)
     )
     factor = np.ones(len(errors))
-    task = Task(
+    task = DesignTask(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
     best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_ROUNDS):
-        problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
+        problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
+        num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = minimise_criterion(
             problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
         )
-        found = [each for each in found if each.value <= _MAX_PERIOD_S]
+        found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
-            if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
+            if (empty_rounds := empty_rounds + 1) == _MAX_ROUNDS_WITHOUT_MOTION:
                 break
             around = None
             continue
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
-        covariance = predicted_covariance(*motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.phi)
+        covariance = predicted_covariance(
+            *motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.heaviest_phi
+        )
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _MAX_START_MISFIT else None
+        around = problem.best if worst < _MAX_MISFIT_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
             vain_rounds = (
                 0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
-                excitation = make_checked_excitation(robot, "period", found, trajectory, uses)
+                excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
-            if vain_rounds == _MAX_VAIN_ROUNDS:
+            if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
         new_factor = factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         factor = (
-            _FACTOR_MARGIN * np.maximum(new_factor, factor) if worst > 1.0 and k > 0 else new_factor
+            _FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
+            if worst > 1.0 and k > 0
+            else new_factor
         )
     if best is not None:
         return best
@@ -158,7 +163,7 @@ def sidak_factor(count: int) -> float:
     return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
 
-class ShortestProblem(Problem):
+class ShortestMotionProblem(DesignProblem):
     """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
@@ -170,16 +175,16 @@ class ShortestProblem(Problem):
         best: unknowns of the shortest period passed to `value`.
     """
 
-    def __init__(self, task: Task, errors: Array, robot: Robot, around: Array | None) -> None:
+    def __init__(self, task: DesignTask, errors: Array, robot: Robot, around: Array | None) -> None:
         super().__init__(task)
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise_densities(robot.noise, robot.limits.phi)
-        self._roots = np.sqrt(robot.noise.white[:6])
-        samples, n = self._vectors.shape[1], len(task.home)
+        self._noise = relative_white_noise_densities(robot.noise, robot.limits.heaviest_phi)
+        self._roots = np.sqrt(robot.noise.white_noise_densities[:6])
+        samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
-        self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
+        self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
@@ -193,7 +198,7 @@ class ShortestProblem(Problem):
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
-        self.task = replace(task, period=period)  # the size of motions depends on the period
+        self.task = replace(task, period_s=period)  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
         self.task = task
         return np.append(x, np.log(period))
@@ -210,21 +215,21 @@ class ShortestProblem(Problem):
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
-        task, n, self._at = self.task, len(self.task.home), x.copy()
+        task, n, self._at = self.task, len(self.task.home_posture), x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
         q, qd, qdd = q + x[:n], qd / T, qdd / T**2
-        write_link_motions(task.table, q, qd, qdd, self._motions)
+        write_link_motions(task.arm_table, q, qd, qdd, self._motions)
         write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
-        criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
+        criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
-            task.table,
+            task.arm_table,
             q,
             qd,
             qdd,
@@ -254,9 +259,9 @@ class ShortestProblem(Problem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(self._variances(self._regression_rows(*motion), period)[0])
+        return np.sqrt(self._variances(self._weighted_regressor_rows(*motion), period)[0])
 
-    def _regression_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
+    def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
@@ -276,7 +281,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        rows = self._regression_rows(*self._vectors)
+        rows = self._weighted_regressor_rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
@@ -288,13 +293,13 @@ class ShortestProblem(Problem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
+def relative_white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
-    density = np.diag(noise.white[:6])
-    if noise.filters is not None:
+    density = np.diag(noise.white_noise_densities[:6])
+    if noise.motion_error_filters is not None:
         at_So = np.eye(6)
-        at_So[:3, 3:] = cross_matrix(noise.place)
-        through = spatial_inertia(phi) @ at_So
-        density = density + through @ np.diag(noise.white[6:]) @ through.T
-    roots = np.sqrt(noise.white[:6])
+        at_So[:3, 3:] = cross_matrix(noise.p_SoAo_S)
+        through = spatial_inertia_matrix(phi) @ at_So
+        density = density + through @ np.diag(noise.white_noise_densities[6:]) @ through.T
+    roots = np.sqrt(noise.white_noise_densities[:6])
     return density / np.outer(roots, roots)

@@ -14,7 +14,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file, write_picture
 from drake_teleop.lab.new_station.picture import draw_start
-from drake_teleop.lab.new_station.plan import Plan, plan_station
+from drake_teleop.lab.new_station.plan import StationPlan, plan_station
 from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
@@ -97,15 +97,15 @@ def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _print_plan(plan: Plan, scenario: Path, picture: Path) -> None:
+def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
-    tool = "of the model" if plan.own_tool else "on the sensor"
+    tool = "of the model" if plan.has_own_tool else "on the sensor"
     for name, value in (
-        ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
-        ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
+        ("Joints", f"{len(plan.joint_names)}: {', '.join(plan.joint_names)}"),
+        ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
         ("Start", f"sensor at {round_to_four_digits(plan.place.position)} m, tool down"),
         ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
@@ -113,9 +113,9 @@ def _print_plan(plan: Plan, scenario: Path, picture: Path) -> None:
         table.add_row(name, value)
     console = Console()
     console.print(table)
-    notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
+    notes = [f"note: {plan.tool_axis_advice}"] if plan.tool_axis_advice else []
     notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
-    notes += [f"warning: {overlap}" for overlap in plan.overlaps]
+    notes += [f"warning: {overlap}" for overlap in plan.overlap_warnings]
     for line in (
         *notes,
         f"picture of the start: {picture}",

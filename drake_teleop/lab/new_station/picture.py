@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
-from drake_teleop.lab.new_station.plan import Plan
+from drake_teleop.lab.new_station.plan import StationPlan
 from drake_teleop.lab.new_station.random_postures import postures_at
 from drake_teleop.lab.new_station.text import wall_of_plan
 from drake_teleop.station.slave.posture_shapes import PostureShapes
@@ -28,32 +28,35 @@ _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from t
 _WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _TRIAD_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
-_SPIRAL_STEPS = np.arange(0.5, 250.0)
-_SAMPLED_DIRECTIONS = np.column_stack(
+_SPIRAL_INDICES = np.arange(0.5, 250.0)
+_SPIRAL_RADII = np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
+_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES
+_HULL_SAMPLE_DIRECTIONS = np.column_stack(
     [
-        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
-        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
-        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
-        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
-        1.0 - _SPIRAL_STEPS / 125.0,
+        _SPIRAL_RADII * np.cos(_SPIRAL_ANGLES_RAD),
+        _SPIRAL_RADII * np.sin(_SPIRAL_ANGLES_RAD),
+        1.0 - _SPIRAL_INDICES / 125.0,
     ]
 )
 
 
-def draw_start(plan: Plan, title: str) -> Figure:
+def draw_start(plan: StationPlan, title: str) -> Figure:
     """Draw the shapes in the start posture; meshes as convex hulls."""
-    shapes, wall = plan.shapes, wall_of_plan(plan)
+    shapes, wall = plan.posture_shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade_triangles(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
-    chain = _joint_chain_points(plan)
+    at_start = postures_at(shapes.arm, plan.place.q[np.newaxis])
+    chain = np.vstack([at_start.origins[0], at_start.p_WS])
     points = np.vstack([surfaces.reshape(-1, 3), chain])
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
         figure = Picture(figsize=(10.0, 5.0), facecolor="white")
         figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
-        side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
+        side = np.degrees(
+            np.arctan2(*(plan.lowest_tool_point_W - shapes.arm.table[0, 9:12])[1::-1])
+        )
         for k, (elevation, azimuth) in enumerate(_VIEW_ANGLES_DEG):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
             collection = Poly3DCollection(
@@ -61,17 +64,17 @@ def draw_start(plan: Plan, title: str) -> Figure:
             )
             axes.add_collection3d(collection)
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
-            _draw_plane(axes, lower, upper, plan.plane)
+            _draw_plane(axes, lower, upper, plan.base_plane_height)
             _draw_triad(axes, shapes, _TRIAD_LENGTH_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
-            _fit_view(axes, lower, upper, plan.plane)
+            _fit_view(axes, lower, upper, plan.base_plane_height)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
 
 
-def _caption(plan: Plan) -> str:
-    gap = 1e3 * (plan.lowest[2] - wall_of_plan(plan).position[2])
-    plane = round(plan.plane, 2) + 0.0  # not -0
+def _caption(plan: StationPlan) -> str:
+    gap = 1e3 * (plan.lowest_tool_point_W[2] - wall_of_plan(plan).position[2])
+    plane = round(plan.base_plane_height, 2) + 0.0  # not -0
     return (
         f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
         " y green, z blue; meshes as convex hulls"
@@ -97,8 +100,8 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
 
 
 def _hull_triangles(points: Array) -> Array:
-    if len(points) > len(_SAMPLED_DIRECTIONS):
-        points = points[np.unique((points @ _SAMPLED_DIRECTIONS.T).argmax(axis=0))]
+    if len(points) > len(_HULL_SAMPLE_DIRECTIONS):
+        points = points[np.unique((points @ _HULL_SAMPLE_DIRECTIONS.T).argmax(axis=0))]
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
@@ -113,14 +116,9 @@ def _hull_triangles(points: Array) -> Array:
 def _box_triangles(top: Array, size: Array) -> Array:
     # Small triangles are better sorted by depth than large ones.
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
-        _WALL_DIVISIONS,
-        _WALL_DIVISIONS,
-        2,
-    ]
-    pieces = [
-        _hull_triangles(cell + corners / [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]) for cell in cells
-    ]
+    counts = [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]
+    cells = np.array(list(product(*map(range, counts)))) / counts
+    pieces = [_hull_triangles(cell + corners / counts) for cell in cells]
     unit = np.concatenate(pieces)
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
     triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
@@ -141,11 +139,6 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     lines = [[(a, y[0], height), (a, y[-1], height)] for a in x]
     lines += [[(x[0], b, height), (x[-1], b, height)] for b in y]
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
-
-
-def _joint_chain_points(plan: Plan) -> Array:
-    at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
-    return np.vstack([at_start.origins[0], at_start.p_WS])
 
 
 def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:

@@ -23,14 +23,14 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.random_postures import (
     NUM_POSTURES,
     Postures,
-    Region,
+    StartRegion,
     degrees_of_freedom,
     joint_margins,
     posture_scores,
     postures_at,
     random_postures,
+    rotate_sensor_frame_of_arm,
     select_suitable_postures,
-    with_tool_axis,
 )
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
 from drake_teleop.station.slave.arm import (
@@ -59,55 +59,55 @@ TOOL_AXES = {
 _CUBE_HALVES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
 # Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
 # postures whose shapes are checked if all solved ones overlap.
-_NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES, _NUM_CHECKED = 40, 12, 60, 500
+_NUM_CANDIDATES, _NUM_FINALISTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
-_MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
+_MAX_POSITION_ERROR_RATIO = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
-_MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
+_MIN_JOINT_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
 MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
-_SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_JOINT_STEP = 2.0  # largest joint displacement to a corner of the cube [rad, m]
-_SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
+_SUFFICIENT_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
+_MAX_JOINT_DISPLACEMENT = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_SUFFICIENT_CUBE_HALF_M = 0.15  # sufficient half edge of the cube [m]
 _SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
-_WALL_ABOVE_M, _WALL_BELOW_M = 0.015, 0.16
-_MAX_WALL_SHARE = 0.6  # largest edge of a wall, over the reach
+_SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
+_MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
 # Cost of overlaps and of shapes below the base plane [1/m], of any overlap, of each smaller wall.
-_COST_PER_M, _COST_OF_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
+_OVERLAP_COST_PER_M, _COST_OF_ANY_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
 
 
-class Place(NamedTuple):
+class StartPlace(NamedTuple):
     """Start of an arm whose tool points down.
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: True if the position specifies the pose.
+        is_set_by_position: True if the position specifies the pose.
         q: (n,) joint positions at the start [rad].
-        half: half edge of the reachable cube around the start [m].
-        room: smallest distance of a joint to its limit, over half the joint's range.
-        score: merit of the posture, see `posture_scores`, without the cost of overlaps.
-        wall: edge of the wall that fits below the tool [m].
-        vertical: True if the arm can only move up and down by `half`.
-        overlaps: True if shapes of the arm overlap.
+        cube_half_m: half edge of the reachable cube around the start [m].
+        joint_margin: smallest distance of a joint to its limit, over half the joint's range.
+        posture_score: merit of the posture, see `posture_scores`, without the cost of overlaps.
+        wall_edge_m: edge of the wall that fits below the tool [m].
+        moves_only_vertically: True if the arm can only move up and down by `cube_half_m`.
+        has_overlaps: True if shapes of the arm overlap.
     """
 
     pose: Array
-    by_position: bool
+    is_set_by_position: bool
     q: Array
-    half: float
-    room: float
-    score: float = 0.0
-    wall: float = WALL_EDGES_M[0]
-    vertical: bool = False
-    overlaps: bool = False
+    cube_half_m: float
+    joint_margin: float
+    posture_score: float = 0.0
+    wall_edge_m: float = WALL_EDGES_M[0]
+    moves_only_vertically: bool = False
+    has_overlaps: bool = False
 
     @property
     def reachable_text(self) -> str:
         """Reachable displacements from the start, as a text."""
-        directions = "up and down" if self.vertical else "in all directions"
-        return f"{1e3 * self.half:g} mm {directions}"
+        directions = "up and down" if self.moves_only_vertically else "in all directions"
+        return f"{1e3 * self.cube_half_m:g} mm {directions}"
 
     @property
     def position(self) -> Array:
@@ -117,7 +117,7 @@ class Place(NamedTuple):
     @property
     def home(self) -> list[float]:
         """Joint positions for `slave.home`; empty if the position is sufficient."""
-        return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
+        return [] if self.is_set_by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 class TrialWalls(Environment):
@@ -134,7 +134,7 @@ class TrialWalls(Environment):
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
-            shape = Box(edge, edge, _WALL_ABOVE_M + _WALL_BELOW_M)
+            shape = Box(edge, edge, _SPACE_ABOVE_TOOL_POINT_M + _SPACE_BELOW_TOOL_POINT_M)
             plant.RegisterCollisionGeometry(
                 body, RigidTransform(), shape, name, ProximityProperties()
             )
@@ -144,13 +144,13 @@ def _wall_name(edge: float) -> str:
     return f"wall of {edge:g} m"
 
 
-def find_place(
+def find_start_place(
     arm: ArmModel,
     shapes: PostureShapes | None = None,
     *,
     plane: float = 0.0,
     axis: str = "z",
-) -> Place:
+) -> StartPlace:
     """Find a start at which the tool points down.
 
     Args:
@@ -159,43 +159,42 @@ def find_place(
         axis: axis of S along the tool, one of `TOOL_AXES`.
     """
     R_SA = TOOL_AXES[axis]
-    pointed = with_tool_axis(arm, R_SA.matrix())
+    pointed = rotate_sensor_frame_of_arm(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
-    found = list[Place]()
+    found = list[StartPlace]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
         solved = _solve_candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
         found += [_with_largest_wall(shapes, place, region) for place in solved]
-        if not all(place.overlaps for place in found):
+        if not all(place.has_overlaps for place in found):
             break
-    found.sort(key=lambda place: place.score, reverse=True)
-    good = [place for place in found if place.score > found[0].score - _SCORE_TOLERANCE]
+    found.sort(key=lambda place: place.posture_score, reverse=True)
+    good = [
+        place for place in found if place.posture_score > found[0].posture_score - _SCORE_TOLERANCE
+    ]
     best = None
     for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
-        if best is None or best.half == 0.0:
+        if best is None or best.cube_half_m == 0.0:
             cubes = [
                 _with_reachable_cube(pointed, place, is_free, vertical)
-                for place in places[:_NUM_CUBES]
+                for place in places[:_MAX_TESTED_CUBES]
             ]
             best = max(cubes, key=_place_merit, default=None)
-    if best is None or best.half == 0.0:
+    if best is None or best.cube_half_m == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
             f" ({_describe_removals(region, len(postures.q))})",
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )
-    pose = np.empty(7)
-    pose_into(arm.table, best.q, pose)
-    if axis == "z":
-        pose = best.pose
-    return best._replace(pose=pose, by_position=best.by_position and axis == "z")
+    pose = best.pose if axis == "z" else _sensor_pose_at(arm, best.q)
+    return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
 def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
-    roomy = joint_margins(arm, q) > _MIN_MARGIN
+    roomy = joint_margins(arm, q) > _MIN_JOINT_MARGIN
     for share in (1.0, MIN_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
@@ -205,13 +204,13 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
-def _describe_removals(region: Region, left: int) -> str:
-    causes = ", ".join(f"in {count} {name}" for name, count in region.removed if count)
+def _describe_removals(region: StartRegion, left: int) -> str:
+    causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
 def _rows_to_solve(
-    arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
+    arm: ArmModel, postures: Postures, region: StartRegion, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
     if not len(postures.q):
         return
@@ -221,7 +220,7 @@ def _rows_to_solve(
     if shapes is None:
         return
     for rows in (usable, order):
-        few = rows[:: len(rows) // _NUM_CHECKED + 1]
+        few = rows[:: len(rows) // _NUM_OVERLAP_CHECKS + 1]
         clear = np.ones(len(few), dtype=bool)
         for k, row in enumerate(few):
             shapes.move_to(postures.q[row])
@@ -230,8 +229,8 @@ def _rows_to_solve(
 
 
 def _solve_candidates(
-    arm: ArmModel, postures: Postures, region: Region, is_free: bool
-) -> Iterator[Place]:
+    arm: ArmModel, postures: Postures, region: StartRegion, is_free: bool
+) -> Iterator[StartPlace]:
     if not is_free:  # position and orientation are coupled
         solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
@@ -246,7 +245,7 @@ def _solve_candidates(
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
-        yield Place(pose, by_position, q, 0.0, float(room), float(merit))
+        yield StartPlace(pose, by_position, q, 0.0, float(room), float(merit))
 
 
 def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
@@ -271,7 +270,9 @@ def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Ar
                 yield found, pose, False
 
 
-def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
+def _with_largest_wall(
+    shapes: PostureShapes | None, place: StartPlace, region: StartRegion
+) -> StartPlace:
     """Return the place with its largest free wall; overlaps reduce its score."""
     if shapes is None:
         return place
@@ -279,7 +280,8 @@ def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Regio
     walls = _move_walls_below_tool(shapes)
     depths = dict.fromkeys(walls, 0.0)
     cost = max(
-        region.plane - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
+        region.plane_height
+        - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
         0.0,
     )
     overlaps = False
@@ -291,19 +293,23 @@ def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Regio
         else:
             cost -= distance
             overlaps |= distance < -MIN_OVERLAP_M
-    large = sum(edge > _MAX_WALL_SHARE * region.reach for edge in WALL_EDGES_M[:-1])
+    large = sum(edge > _MAX_WALL_EDGE_OVER_REACH * region.reach for edge in WALL_EDGES_M[:-1])
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)
     cost += list(depths.values())[rank]
-    score = place.score - _COST_PER_M * cost - _COST_OF_OVERLAP * overlaps
+    score = place.posture_score - _OVERLAP_COST_PER_M * cost - _COST_OF_ANY_OVERLAP * overlaps
     score -= _COST_OF_SMALLER_WALL * (rank - large)
-    return place._replace(score=score, wall=WALL_EDGES_M[rank], overlaps=overlaps)
+    return place._replace(
+        posture_score=score, wall_edge_m=WALL_EDGES_M[rank], has_overlaps=overlaps
+    )
 
 
 def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
     plant, walls = shapes.plant, {}
     x, y, z = lowest_tool_point(shapes)
-    middle = RigidTransform([x, y, z + (_WALL_ABOVE_M - _WALL_BELOW_M) / 2.0])
+    middle = RigidTransform(
+        [x, y, z + (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0]
+    )
     for edge in WALL_EDGES_M:
         body = plant.GetBodyByName(_wall_name(edge))
         plant.SetFreeBodyPose(shapes.context, body, middle)
@@ -327,16 +333,17 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
 
-def _place_merit(place: Place) -> tuple[float, float, bool, float]:
+def _place_merit(place: StartPlace) -> tuple[float, float, bool, float]:
     enough_room, enough_space = (
-        min(place.room, _SUFFICIENT_MARGIN),
-        min(place.half, _SUFFICIENT_HALF_M),
+        min(place.joint_margin, _SUFFICIENT_JOINT_MARGIN),
+        min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_M),
     )
-    return enough_room, enough_space, place.by_position, place.half
+    return enough_room, enough_space, place.is_set_by_position, place.cube_half_m
 
 
-def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    moves = _reaches_by_ik if is_free else _reaches_by_position
+def _with_reachable_cube(
+    arm: ArmModel, place: StartPlace, is_free: bool, vertical: bool
+) -> StartPlace:
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
@@ -344,23 +351,20 @@ def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: b
         signs = signs[[2, 5]]
     largest = 0.0
     for half in _CUBE_HALVES_M:
-        if not all(moves(arm, place, half * each) for each in signs):
+        if not all(_can_reach(arm, place, half * each, is_free) for each in signs):
             break
         largest = half
-    room = place.room if largest else 0.0
-    return place._replace(half=largest, room=room, vertical=vertical)
+    room = place.joint_margin if largest else 0.0
+    return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
-def _reaches_by_ik(arm: ArmModel, place: Place, displacement: Array) -> bool:
-    q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
-    return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_STEP)
-
-
-def _reaches_by_position(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _can_reach(arm: ArmModel, place: StartPlace, displacement: Array, is_free: bool) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
-    q, _ = find_posture(arm, target, place.q)
+    q, status = find_posture(arm, target, place.q)
+    if is_free:
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_DISPLACEMENT)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
-    return bool(error < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement))
+    return bool(error < _MAX_POSITION_ERROR_RATIO * np.linalg.norm(displacement))
 
 
 _MIN_AXIS_COSINE = 0.75  # smallest cosine of the angle between tool and axis

@@ -14,10 +14,10 @@ from drake_teleop.lab.new_station.place import (
     MIN_LOAD_SHARE,
     OPPOSITE_AXIS,
     TOOL_AXES,
-    Place,
+    StartPlace,
     TrialWalls,
     extent_beyond_sensor,
-    find_place,
+    find_start_place,
     last_joint_axis,
     lowest_tool_point,
     nearest_axis,
@@ -32,57 +32,58 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
-_PHANTOM_HALF_SIZE_M = 0.08
+_PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
-_MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
-_COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
-_STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
+_MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
+_STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_RADIUS_M = 0.05, 0.1, 0.012
+_STAND_IN_FREE_LENGTH_M = 0.05
+_STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
 _MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
-_CONTACT_FORCE_N = 30.0
+_DISPLAYABLE_CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
-WALL_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
 SWING_HZ, _MAX_SPEED_USE = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
 
 
 @dataclass(frozen=True)
-class Plan:
+class StationPlan:
     """Start, scales and motions of a new station.
 
     Args:
-        tool: stand-in for a missing tool, or None.
-        tool_mass: mass beyond the sensor [kg].
-        own_tool: True if the model contains the tool.
-        swing: amplitude of the slave in free motion [m].
-        lowest: (3,) position in W of the tool's lowest point at the start [m].
-        tip: (3,) p_STip of this point [m]; empty for a tool along z_S.
-        axis_note: advice if the tool is not along z_S.
-        overlaps: sentences about overlaps of shapes at the start.
-        plane: height of the base plane [m].
+        stand_in_tool: stand-in for a missing tool, or None.
+        tool_mass_kg: mass beyond the sensor [kg].
+        has_own_tool: True if the model contains the tool.
+        swing_amplitude_m: amplitude of the slave in free motion [m].
+        lowest_tool_point_W: (3,) position in W of the tool's lowest point at the start [m].
+        tip_S: (3,) p_STip of this point [m]; empty for a tool along z_S.
+        tool_axis_advice: advice if the tool is not along z_S.
+        overlap_warnings: sentences about overlaps of shapes at the start.
+        base_plane_height: height of the base plane [m].
         weak_joints: joints whose torque limits cannot hold the arm.
-        shapes: shapes of arm and tool, at the start.
+        posture_shapes: shapes of arm and tool, at the start.
     """
 
-    joints: tuple[str, ...]
-    tool: Tool | None
-    tool_mass: float
-    own_tool: bool
-    place: Place
+    joint_names: tuple[str, ...]
+    stand_in_tool: Tool | None
+    tool_mass_kg: float
+    has_own_tool: bool
+    place: StartPlace
     translation_scale: float
     force_scale: float
-    swing: float
-    lowest: Array
-    tip: list[float]
+    swing_amplitude_m: float
+    lowest_tool_point_W: Array
+    tip_S: list[float]
     assumptions: tuple[str, ...]
-    axis_note: str
-    overlaps: tuple[str, ...]
-    plane: float
+    tool_axis_advice: str
+    overlap_warnings: tuple[str, ...]
+    base_plane_height: float
     weak_joints: tuple[str, ...]
-    shapes: PostureShapes
+    posture_shapes: PostureShapes
 
 
 def plan_station(
@@ -91,9 +92,9 @@ def plan_station(
     package_paths: tuple[Path, ...] = (),
     tool: Path | None = None,
     device: str = PHANTOM_NAME,
-) -> Plan:
+) -> StationPlan:
     """Choose start, scales and motions for an arm and a device."""
-    stand_in = _stand_in_tool("z", _LENGTH_M)
+    stand_in = _stand_in_tool("z", _STAND_IN_LENGTH_M)
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
@@ -103,11 +104,11 @@ def plan_station(
     shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_LOAD if tool is None else 0.0)
     axis, own_tool = _tool_axis(shapes, load), False
-    if tool is None and _reaches_beyond_link(shapes, axis) and load[0] > _MIN_MASS_KG:
+    if tool is None and _reaches_beyond_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
-    place, axis, shapes = _find_start(slave, shapes, plane, axis)
+    place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
     share = 1.0 if own_tool else MIN_LOAD_SHARE if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
@@ -115,43 +116,45 @@ def plan_station(
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
-    room = _PHANTOM_HALF_SIZE_M if figures is None else min(figures.size) / 2.0
+    room = _PHANTOM_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
-    translation_scale = _floor_two_digits(min(place.half / room, 1.0))
+    translation_scale = _floor_two_digits(min(place.cube_half_m / room, 1.0))
     force_scale = min(
-        peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
-        _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS * translation_scale),
+        peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N),
+        _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale),
         1.0,
     )
     shapes.move_to(place.q)
     lowest = lowest_tool_point(shapes)
-    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
+    swing = min(_MAX_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
-    return Plan(
-        joints=tuple(model.joint_names),
-        tool=on_sensor,
-        tool_mass=mass,
-        own_tool=own_tool,
+    return StationPlan(
+        joint_names=tuple(model.joint_names),
+        stand_in_tool=on_sensor,
+        tool_mass_kg=mass,
+        has_own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
         force_scale=_floor_two_digits(force_scale),
-        swing=_floor_two_digits(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
-        lowest=lowest,
-        tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
+        swing_amplitude_m=_floor_two_digits(
+            swing * min(1.0, _MAX_SPEED_USE / _swing_speed_use(model, place, swing))
+        ),
+        lowest_tool_point_W=lowest,
+        tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
         assumptions=(*shapes.assumptions, *assumed),
-        axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
-        overlaps=tuple(overlap_warnings(shapes, of_arm=True)),
-        plane=plane,
+        tool_axis_advice=tool_frame_advice(model, arm, sensor_frame, axis),
+        overlap_warnings=tuple(overlap_warnings(shapes, of_arm=True)),
+        base_plane_height=plane,
         weak_joints=weak_joints,
-        shapes=shapes,
+        posture_shapes=shapes,
     )
 
 
-def _find_start(
+def _find_start_and_tool_axis(
     slave: Slave, shapes: PostureShapes, plane: float, natural: str
-) -> tuple[Place, str, PostureShapes]:
+) -> tuple[StartPlace, str, PostureShapes]:
     # The start, the tool's axis of S, and the shapes; a stand-in tool is set along that axis.
-    found: list[tuple[Place, str, PostureShapes]] = []
+    found: list[tuple[StartPlace, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
     for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
@@ -159,17 +162,19 @@ def _find_start(
             continue
         if is_stand_in:
             slave.tool = _stand_in_tool(axis, _stand_in_length(shapes, axis))
-            if axis != "z" or slave.tool.shapes[0].position[2] != _LENGTH_M:
+            if axis != "z" or slave.tool.shapes[0].position[2] != _STAND_IN_LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
-            found.append((find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes))
+            found.append(
+                (find_start_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes)
+            )
         except DrakeTeleopError as error:
             errors.append(error)
-        if found and found[-1][0].score > _SUFFICIENT_SCORE:
+        if found and found[-1][0].posture_score > _SUFFICIENT_SCORE:
             break
     if not found:
         raise errors[0]
-    best = max(found, key=lambda each: each[0].score)
+    best = max(found, key=lambda each: each[0].posture_score)
     if is_stand_in:
         slave.tool = _stand_in_tool(best[1], _stand_in_length(best[2], best[1]))
     return best
@@ -177,7 +182,7 @@ def _find_start(
 
 def _tool_axis(shapes: PostureShapes, load: Array) -> str:
     """Return the axis of S towards the model's own load, or else along the last joint; else z."""
-    if load[0] > _MIN_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
+    if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
         return axis
     return last_joint_axis(shapes.arm) or "z"
 
@@ -201,13 +206,15 @@ def base_plane(shapes: PostureShapes) -> float:
 
 def _stand_in_tool(axis: str, length: float) -> Tool:
     along = TOOL_AXES[axis].matrix()[:, 2]
-    ball = Ball(_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
-    return Tool(mass=_STAND_IN_MASSES_KG[0], com=(_COM_M * along).round(6).tolist(), shapes=[ball])
+    ball = Ball(_STAND_IN_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
+    return Tool(
+        mass=_STAND_IN_MASSES_KG[0], com=(_STAND_IN_COM_M * along).round(6).tolist(), shapes=[ball]
+    )
 
 
 def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
     end = extent_beyond_sensor(shapes, shapes.bodies_welded_to_sensor() - {shapes.tool_body}, axis)
-    return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
+    return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
 
 
 def _without_weak_limits(
@@ -237,7 +244,7 @@ def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     return mass
 
 
-def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
+def _swing_speed_use(arm: ArmModel, place: StartPlace, swing: float) -> float:
     above = place.pose.copy()
     above[6] += swing
     displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)

@@ -22,18 +22,22 @@ NUM_POSTURES = 20_000
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
 # Distance of S from the vertical line through the first joint, and its height above that joint, in
 # units of the reach.
-_RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.8)
+_RADIUS_RANGE_OVER_REACH, _HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
-_PREFERRED_RADIUS, _PREFERRED_HEIGHT, _LOWEST_PREFERRED_HEIGHT = 0.6, 0.25, -0.4
-_MAX_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
+(
+    _PREFERRED_RADIUS_OVER_REACH,
+    _PREFERRED_TOOL_HEIGHT_OVER_REACH,
+    _MIN_PREFERRED_HEIGHT_OVER_REACH,
+) = 0.6, 0.25, -0.4
+_MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
-_SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 2.0
+_SIDE_HALF_WIDTH_RAD, _NUM_SIDES, _FRONT_SIDE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _ROUNDING_TOLERANCE = 1e-9  # singular values that are 0, over the largest
 _NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
-_GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
+_SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,37 +63,37 @@ class Postures:
 
 
 @dataclass(frozen=True)
-class Region:
+class StartRegion:
     """Region in which a start is searched.
 
     Attributes:
-        plane: height of the base plane [m].
+        plane_height: height of the base plane [m].
         tool_length: distance of the tool's end from S [m].
-        first: (3,) origin of the first joint, p_W [m].
+        first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
-        raised: (n,) True for joints above the base plane, not of a mobile base.
-        side: direction of the region about z_W, from x_W [rad].
-        removed: number of postures that each condition removed.
+        is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
+        side_rad: direction of the region about z_W, from x_W [rad].
+        removed_counts: number of postures that each condition removed.
     """
 
-    plane: float
+    plane_height: float
     tool_length: float
-    first: Array
+    first_joint_W: Array
     reach: float
-    raised: NDArray[np.bool_]
-    side: float = 0.0
-    removed: tuple[tuple[str, int], ...] = ()
+    is_joint_above_plane: NDArray[np.bool_]
+    side_rad: float = 0.0
+    removed_counts: tuple[tuple[str, int], ...] = ()
 
     @property
-    def preferred(self) -> Array:
+    def preferred_position(self) -> Array:
         """Preferred position p_WS (3,) of the sensor [m]."""
-        r, height = _PREFERRED_RADIUS * self.reach, self.plane + self.tool_length
+        r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane_height + self.tool_length
         height = max(
-            height + _PREFERRED_HEIGHT * self.reach,
-            float(self.first[2]) + _LOWEST_PREFERRED_HEIGHT * self.reach,
+            height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
+            float(self.first_joint_W[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
         )
-        direction = np.array([np.cos(self.side), np.sin(self.side)])
-        return np.array([*(self.first[:2] + r * direction), height])
+        direction = np.array([np.cos(self.side_rad), np.sin(self.side_rad)])
+        return np.array([*(self.first_joint_W[:2] + r * direction), height])
 
 
 def postures_at(arm: ArmModel, q: Array) -> Postures:
@@ -104,13 +108,10 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
         if row is not arm.table[-1] and row[IS_PRISMATIC_COLUMN]:
             p = p + angle[:, None] * R[:, :, 2]
         else:
-            R = R @ _rotations_about_z(angle)
+            c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
+            rows = c, -s, zero, s, c, zero, zero, zero, zero + 1.0
+            R = R @ np.stack(rows, 1).reshape(-1, 3, 3)  # rotation about z
     return Postures(q, np.stack(origins[:-1], 1), np.stack(axes[:-1], 1), R, p)
-
-
-def _rotations_about_z(angle: Array) -> Array:
-    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], 1).reshape(-1, 3, 3)
 
 
 def random_postures(arm: ArmModel) -> Postures:
@@ -122,7 +123,7 @@ def random_postures(arm: ArmModel) -> Postures:
 
 def select_suitable_postures(
     postures: Postures, plane: float, tool_length: float
-) -> tuple[Postures, Region]:
+) -> tuple[Postures, StartRegion]:
     """Return postures with the tool downwards, in reach and above `plane`, and their region.
 
     Only those on the side of the first joint with most of them; `plane` is the height z_W of
@@ -140,10 +141,10 @@ def select_suitable_postures(
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
-            _is_within(radius / reach, _RADIUS)
-            & _is_within(from_first[:, 2] / reach, _HEIGHT)
+            _is_within(radius / reach, _RADIUS_RANGE_OVER_REACH)
+            & _is_within(from_first[:, 2] / reach, _HEIGHT_RANGE_OVER_REACH)
             & (tool_height > _MIN_TOOL_HEIGHT_M)
-            & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
+            & (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1),
         ),
         (
             "a joint is below the base plane",
@@ -157,9 +158,9 @@ def select_suitable_postures(
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
     sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
     counts = np.array([float(_is_on_side(angle, side).sum()) for side in sides])
-    counts[0] *= _FRONT_ADVANTAGE
+    counts[0] *= _FRONT_SIDE_COUNT_FACTOR
     side = float(sides[int(np.argmax(counts))])
-    region = Region(plane, tool_length, first, reach, raised, side, tuple(removed))
+    region = StartRegion(plane, tool_length, first, reach, raised, side, tuple(removed))
     return postures[rows[_is_on_side(angle, side)]], region
 
 
@@ -169,22 +170,27 @@ def _is_within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
 
 
 def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_RAD)
+    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_HALF_WIDTH_RAD)
     return near
 
 
-def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
+def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
     It combines limits, singularities, elbow, base plane and preferred place.
     """
-    margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
+    margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
-    sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
-    elbow = np.minimum(elbow_up_share(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
-    origins = postures.origins[:, region.raised, 2]
-    low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
-    away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
+    # Only as many singular values as the arm has degrees of freedom.
+    smallest = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
+    elbow = (
+        np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
+        / _SUFFICIENT_ELBOW_UP_SHARE
+    )
+    origins = postures.origins[:, region.is_joint_above_plane, 2]
+    low = np.maximum(region.plane_height + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
+    away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
     total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
     return total
 
@@ -215,12 +221,6 @@ def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     return int((values > _ROUNDING_TOLERANCE * values[:, :1]).sum(axis=1).max())
 
 
-def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
-    """Return the smallest singular value (k,) of the Jacobian among its degrees of freedom [m]."""
-    smallest: Array = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
-    return smallest
-
-
 def elbow_up_share(postures: Postures, reach: float) -> Array:
     """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
 
@@ -239,7 +239,7 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
     return np.where(size > _NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
 
 
-def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
+def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:
     """Return the arm with its sensor frame rotated by R_SA, to z along the tool."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.texts import to_yaml_text
-from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS, Plan
+from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS_N_M, StationPlan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import Rates
 
-_MAX_WALL_DEPTH_M = 0.01  # largest depth in the wall
+_MAX_PRESS_DEPTH_M = 0.01  # largest depth in the wall
 
 
 def scenario_text(
-    plan: Plan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
+    plan: StationPlan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
     """Return the commented scenario; `slave` contains model, packages and sensor frame.
 
@@ -23,9 +23,9 @@ def scenario_text(
         tool: path of the tool's file, if given.
         sensor: preset of the wrist sensor, or None.
     """
-    s, swing = plan.translation_scale, plan.swing
-    down = 1.5 * swing + min(_MAX_WALL_DEPTH_M, swing / 4.0)
-    if plan.place.by_position:
+    s, swing = plan.translation_scale, plan.swing_amplitude_m
+    down = 1.5 * swing + min(_MAX_PRESS_DEPTH_M, swing / 4.0)
+    if plan.place.is_set_by_position:
         slave["position"] = round_to_four_digits(plan.place.position)
     else:
         slave["home"] = plan.place.home
@@ -41,16 +41,16 @@ def scenario_text(
     }
     if tool is not None:
         slave["tool"] = {"model": tool}
-    elif plan.tool is None:
+    elif plan.stand_in_tool is None:
         slave["tool"], comments["slave.tool"] = None, "the bodies of the model beyond the sensor"
     else:
-        slave["tool"] = {"mass": plan.tool.mass, "com": plan.tool.com}
-        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.tool.shapes[0])]}
+        slave["tool"] = {"mass": plan.stand_in_tool.mass, "com": plan.stand_in_tool.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.stand_in_tool.shapes[0])]}
         comments["slave.tool"] = "a stand-in: put model file or numbers of your tool here"
     if plan.weak_joints:
         slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
-    if plan.tip:
-        slave["tip"] = round_to_four_digits(plan.tip)
+    if plan.tip_S:
+        slave["tip"] = round_to_four_digits(plan.tip_S)
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
     swing_motion |= {
         "frequency": SWING_HZ,
@@ -78,13 +78,13 @@ def scenario_text(
     return to_yaml_text(data, head=[head], comments=comments)
 
 
-def wall_of_plan(plan: Plan) -> Wall:
+def wall_of_plan(plan: StationPlan) -> Wall:
     """Return the wall below the tool."""
-    x, y, z = plan.lowest
+    x, y, z = plan.lowest_tool_point_W
     return Wall(
-        position=round_to_four_digits([x, y, z - 1.5 * plan.swing]),
-        size=[plan.place.wall, plan.place.wall],
-        stiffness=WALL_STIFFNESS,
+        position=round_to_four_digits([x, y, z - 1.5 * plan.swing_amplitude_m]),
+        size=[plan.place.wall_edge_m, plan.place.wall_edge_m],
+        stiffness=WALL_STIFFNESS_N_M,
     )
 
 

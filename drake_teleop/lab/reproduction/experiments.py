@@ -25,10 +25,10 @@ from drake_teleop.station.simulation import (
 )
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
-Values = dict[str, Any]
+NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_RATIO = 1.5
+_THRESHOLD_OVER_FREE_PEAK = 1.5
 _ALL_AXES_MOTION = Sine(
     duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
 )
@@ -38,12 +38,12 @@ _ALL_AXES_MOTION = Sine(
 class FreeMotion:
     """Recorded free movement.
 
-    `scaled`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
+    `scaled_wrenches`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
     """
 
     scenario: Scenario
     result: SimulationResult
-    scaled: dict[float, Array]
+    scaled_wrenches: dict[float, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +51,13 @@ class IdealMotion:
     """Free movement with exact wrench and motion instead of sensor readings.
 
     Attributes:
-        reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
-        motion: specific force, angular velocity and angular acceleration of S, (N, 3) each.
+        weld_reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
+        sensor_motion: specific force, angular velocity and angular acceleration of S, (N, 3) each.
         phi: (10,) true load.
     """
 
-    reaction: Array
-    motion: tuple[Array, Array, Array]
+    weld_reaction: Array
+    sensor_motion: tuple[Array, Array, Array]
     phi: Array
 
 
@@ -66,21 +66,21 @@ class ContactMotion:
     """Recorded contact transition, and the same movement without the leaf spring.
 
     Attributes:
-        raw: (N, 6) measured wrench without offsets, F - F_o.
-        calculated: (N, 6) calculated contact wrench.
-        contact: (N,) True in true contact.
-        threshold: force threshold of the contact detection [N].
+        measured_wrench: (N, 6) measured wrench without offsets, F - F_o.
+        calculated_wrench: (N, 6) calculated contact wrench.
+        in_contact: (N,) True in true contact.
+        threshold_N: force threshold of the contact detection [N].
     """
 
     scenario: Scenario
-    touched: SimulationResult
-    free: SimulationResult
-    raw: Array
-    calculated: Array
-    raw_free: Array
-    calculated_free: Array
-    contact: NDArray[np.bool_]
-    threshold: float
+    contact_result: SimulationResult
+    free_result: SimulationResult
+    measured_wrench: Array
+    calculated_wrench: Array
+    measured_wrench_free: Array
+    calculated_wrench_free: Array
+    in_contact: NDArray[np.bool_]
+    threshold_N: float
 
 
 def simulate_free_motion(
@@ -100,14 +100,14 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
     calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
     return ContactMotion(
         scenario=scenario,
-        touched=touched,
-        free=free,
-        raw=_scaled_wrench_at_slave(touched, estimate, 1.0),
-        calculated=_scaled_wrench_at_slave(touched, estimate, 0.0),
-        raw_free=_scaled_wrench_at_slave(free, estimate, 1.0),
-        calculated_free=calculated_free,
-        contact=is_in_contact(touched),
-        threshold=_THRESHOLD_RATIO * float(_force_norm(calculated_free).max()),
+        contact_result=touched,
+        free_result=free,
+        measured_wrench=_scaled_wrench_at_slave(touched, estimate, 1.0),
+        calculated_wrench=_scaled_wrench_at_slave(touched, estimate, 0.0),
+        measured_wrench_free=_scaled_wrench_at_slave(free, estimate, 1.0),
+        calculated_wrench_free=calculated_free,
+        in_contact=is_in_contact(touched),
+        threshold_N=_THRESHOLD_OVER_FREE_PEAK * float(_force_norm(calculated_free).max()),
     )
 
 
@@ -142,23 +142,26 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
     return IdealMotion(wrenches[taken[started]], (s, omega, alpha), phi)
 
 
-def ideal_values(run: IdealMotion) -> Values:
+def ideal_values(run: IdealMotion) -> NamedValues:
     """Return peak wrenches and the errors of the calculated load wrench, by name."""
-    load = regressor(*run.motion) @ run.phi
+    load = regressor(*run.sensor_motion) @ run.phi
     left = np.concatenate(
-        [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
+        [
+            contact_wrench(run.weld_reaction, np.zeros(6), *run.sensor_motion, run.phi),
+            run.weld_reaction - load,
+        ]
     )
     return {
-        "peak_raw_N": _largest_norm(run.reaction[:, :3]),
-        "peak_raw_Nm": _largest_norm(run.reaction[:, 3:]),
+        "peak_raw_N": _largest_norm(run.weld_reaction[:, :3]),
+        "peak_raw_Nm": _largest_norm(run.weld_reaction[:, 3:]),
         "residual_max_N": _largest_norm(left[:, :3]),
         "residual_max_Nm": _largest_norm(left[:, 3:]),
     }
 
 
-def free_values(run: FreeMotion, component: int, unit: str) -> Values:
+def free_values(run: FreeMotion, component: int, unit: str) -> NamedValues:
     """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
-    raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
+    raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
     peak = float(np.abs(raw).max())
@@ -168,36 +171,36 @@ def free_values(run: FreeMotion, component: int, unit: str) -> Values:
         "half_ratio": _rms(half) / _rms(raw),
         f"residual_max_{unit}": float(np.abs(rest).max()),
         f"residual_rms_{unit}": _rms(rest),
-        f"residual_norm_max_{unit}": _largest_norm(run.scaled[0.0][:, vector]),
+        f"residual_norm_max_{unit}": _largest_norm(run.scaled_wrenches[0.0][:, vector]),
     }
 
 
-def contact_values(run: ContactMotion) -> Values:
-    t, force_norm = run.touched.t, _force_norm(run.calculated)
-    detected = force_norm > run.threshold
+def contact_values(run: ContactMotion) -> NamedValues:
+    t, force_norm = run.contact_result.t, _force_norm(run.calculated_wrench)
+    detected = force_norm > run.threshold_N
     window = _contact_window(run)
     after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
     return {
-        "true_s": _first_time(t, run.contact),
+        "true_s": _first_time(t, run.in_contact),
         "detected_s": _first_time(t, detected),
-        "threshold_N": run.threshold,
-        "raw_detectable": bool(raw_force_excess(run).max() > 0),
+        "threshold_N": run.threshold_N,
+        "raw_detectable": bool(raw_force_beyond_free_range(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
         "peak_contact_N": float(force_norm.max()),
-        "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
-        "peak_inertial_N": _largest_norm((run.raw - run.calculated)[:, :3]),
-        "duration_s": float(np.count_nonzero(run.contact) * (t[1] - t[0])),
-        "largest_deflection_mm": 1e3 * float(np.abs(run.touched["sheet_state"][:, 0]).max()),
-        "free_residual_norm_max_N": float(_force_norm(run.calculated_free).max()),
-        "free_residual_norm_max_Nm": _largest_norm(run.calculated_free[:, 3:]),
+        "peak_true_contact_N": _largest_norm(run.contact_result["true_contact_wrench_W"][:, :3]),
+        "peak_inertial_N": _largest_norm((run.measured_wrench - run.calculated_wrench)[:, :3]),
+        "duration_s": float(np.count_nonzero(run.in_contact) * (t[1] - t[0])),
+        "largest_deflection_mm": 1e3 * float(np.abs(run.contact_result["sheet_state"][:, 0]).max()),
+        "free_residual_norm_max_N": float(_force_norm(run.calculated_wrench_free).max()),
+        "free_residual_norm_max_Nm": _largest_norm(run.calculated_wrench_free[:, 3:]),
     }
 
 
-def raw_force_excess(run: ContactMotion) -> Array:
+def raw_force_beyond_free_range(run: ContactMotion) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
-        for raw in (run.raw[_contact_window(run)], run.raw_free)
+        for raw in (run.measured_wrench[_contact_window(run)], run.measured_wrench_free)
     )
     if not len(touched):
         return np.full(4, -np.inf)
@@ -206,7 +209,7 @@ def raw_force_excess(run: ContactMotion) -> Array:
     )
 
 
-def identification_values(load: LoadIdentification, scenario: Scenario) -> Values:
+def identification_values(load: LoadIdentification, scenario: Scenario) -> NamedValues:
     """Return errors and expected accuracy of the load estimate, by name."""
     truth = true_parameters(scenario)
     error = load.estimate - truth
@@ -251,16 +254,16 @@ def _scaled_wrench_at_slave(result: SimulationResult, estimate: Array, sigma: fl
 
 
 def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
-    t = run.touched.t
-    if not run.contact.any():
-        return run.contact
-    times = t[run.contact]
+    t = run.contact_result.t
+    if not run.in_contact.any():
+        return run.in_contact
+    times = t[run.in_contact]
     return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
 
 
-def reversal_without_contact(run: ContactMotion) -> float | None:
+def time_of_free_reversal(run: ContactMotion) -> float | None:
     """Return the time of the largest raw force after contact [s], or None."""
-    t, force_norm = run.touched.t, _force_norm(run.raw)
+    t, force_norm = run.contact_result.t, _force_norm(run.measured_wrench)
     window = _contact_window(run)
     if not window.any():
         return None

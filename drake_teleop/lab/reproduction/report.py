@@ -38,42 +38,33 @@ class Comparison:
     """Row that compares paper and reproduction.
 
     Args:
-        origin: "set" if the scenario was chosen to match the paper's value; else "found".
-        accepted: accepted range as text; empty if the value is not comparable.
-        holds: True if the value is accepted; None if it is not comparable.
+        set_or_found: "set" if the scenario was chosen to match the paper's value; else "found".
+        accepted_range: accepted range as text; empty if the value is not comparable.
+        is_accepted: True if the value is accepted; None if it is not comparable.
     """
 
-    what: str
-    paper: str
-    ours: str
-    origin: str
-    accepted: str
-    holds: bool | None
+    quantity: str
+    paper_value: str
+    reproduced_value: str
+    set_or_found: str
+    accepted_range: str
+    is_accepted: bool | None
 
     @property
     def verdict(self) -> str:
-        if self.holds is None:
+        if self.is_accepted is None:
             return "for the record"
-        words = _VERDICTS_OF_SET_VALUES if self.origin == "set" else _VERDICTS_OF_FOUND_VALUES
-        if self.paper == _NOT_REPORTED:
+        words = _VERDICTS_OF_SET_VALUES if self.set_or_found == "set" else _VERDICTS_OF_FOUND_VALUES
+        if self.paper_value == _NOT_REPORTED:
             words = _VERDICTS_OF_OUR_BOUND
-        return words[0] if self.holds else words[1]
+        return words[0] if self.is_accepted else words[1]
 
     @property
     def css_class(self) -> str:
         """CSS class of the verdict: "agrees", "differs" (highlighted) or "" (neutral)."""
-        if self.holds is False:
+        if self.is_accepted is False:
             return "differs"
         return "agrees" if self.verdict == "agrees" else ""
-
-
-@dataclass(frozen=True)
-class ReportFigure:
-    """Figure of the report, with title and caption."""
-
-    title: str
-    png: Path
-    caption: str
 
 
 @dataclass(frozen=True)
@@ -133,9 +124,9 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return a text for each value outside its accepted range."""
     return [
-        f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
+        f"{row.quantity}: {row.reproduced_value}, accepted {row.accepted_range}: {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
-        if row.holds is False
+        if row.is_accepted is False
     ]
 
 
@@ -195,29 +186,26 @@ def parameter_rows(
     return rows
 
 
-def library_versions() -> dict[str, str]:
-    names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
-    return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
-
-
 def write_report(
     path: Path,
     *,
     setup: Mapping[str, str],
     summary: Mapping[str, Any],
-    figures: Sequence[ReportFigure],
+    figures: Sequence[tuple[str, Path, str]],
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures."""
+    """Write the HTML page with embedded figures, each a title, a PNG file and a caption."""
+    names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
-        versions=library_versions(),
+        versions={"Python": platform.python_version()}
+        | {name: metadata.version(name) for name in names},
         tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, png_data_url(item.png)) for item in figures],
+        figures=[(title, png_data_url(png), caption) for title, png, caption in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,

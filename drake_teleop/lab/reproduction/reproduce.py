@@ -26,41 +26,44 @@ from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     FreeMotion,
-    Values,
+    NamedValues,
     contact_values,
     free_values,
     ideal_values,
     identification_values,
-    reversal_without_contact,
     simulate_contact,
     simulate_free_motion,
     simulate_ideal_motion,
+    time_of_free_reversal,
     true_parameters,
     without_leaf_spring,
 )
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
-    ReportFigure,
     compare_with_paper,
     figure_captions,
     parameter_rows,
     values_by_full_name,
     write_report,
 )
-from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
+from drake_teleop.lab.reproduction.speed import (
+    MakeBarePlant,
+    MakeMovingStation,
+    cpu_time_per_simulated_second,
+)
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 
 # Slow motion of the replay; the contact lasts 40 ms.
-_SLOW_FACTOR = 8.0
-_FORCE_Z, _TORQUE_X = 2, 3
+_REPLAY_SLOWDOWN = 8.0
+_FORCE_Z_INDEX, _TORQUE_X_INDEX = 2, 3
 
 
 def reproduce_command(
     out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
-) -> Values:
+) -> NamedValues:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Return the summary, and the measured speed, which differs between equal runs.
@@ -68,12 +71,11 @@ def reproduce_command(
     seed = seed or 0
     make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
+        names = ("free_motion_force", "free_motion_torque", "contact_transition")
         # Each run has another seed.
         force, torque, contact = (
-            _log_at_hand_rate(LoadScenario(name), seed + k)
-            for k, name in enumerate(
-                ("free_motion_force", "free_motion_torque", "contact_transition"), 1
-            )
+            replace(each, rates__log_hz=each.rates.hand_hz, simulation__seed=seed + k)
+            for k, each in enumerate(map(LoadScenario, names), 1)
         )
         load = identify_load(identification_scenario(force, seed), stage)
         force_run = simulate_free_motion(
@@ -85,8 +87,8 @@ def reproduce_command(
         ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
         contact_run = simulate_contact(contact, load.estimate, stage)
         summary = {
-            "free_force": free_values(force_run, _FORCE_Z, "N"),
-            "free_torque": free_values(torque_run, _TORQUE_X, "Nm"),
+            "free_force": free_values(force_run, _FORCE_Z_INDEX, "N"),
+            "free_torque": free_values(torque_run, _TORQUE_X_INDEX, "Nm"),
             "ideal": ideal_values(ideal_run),
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
@@ -105,43 +107,39 @@ def reproduce_command(
 
 
 def draw_figures(
-    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
+    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: NamedValues
 ) -> dict[str, Figure]:
     pictures = {
         name: scaling_figure(
             run.result.t,
-            [run.scaled[sigma][:, component] for sigma in SIGMAS],
+            [run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS],
             SIGMAS,
             symbol=symbol,
             unit=unit,
             downscaling=1 / run.scenario.force_scaling.force_scale,
         )
         for name, run, component, symbol, unit in (
-            ("fig6", force, _FORCE_Z, "$f_z$", "N"),
-            ("fig7", torque, _TORQUE_X, r"$\tau_x$", "N m"),
+            ("fig6", force, _FORCE_Z_INDEX, "$f_z$", "N"),
+            ("fig7", torque, _TORQUE_X_INDEX, r"$\tau_x$", "N m"),
         )
     }
     detected = summary["contact"]["detected_s"]
     pictures["fig8"] = contact_figure(
-        contact.touched.t,
-        contact.raw[:, _FORCE_Z],
-        contact.calculated[:, _FORCE_Z],
+        contact.contact_result.t,
+        contact.measured_wrench[:, _FORCE_Z_INDEX],
+        contact.calculated_wrench[:, _FORCE_Z_INDEX],
         symbol="$f_z$",
-        contact=contact.contact,
+        contact=contact.in_contact,
         detected_s=math.nan if detected is None else detected,
-        threshold=contact.threshold,
-        turning_s=reversal_without_contact(contact),
+        threshold=contact.threshold_N,
+        turning_s=time_of_free_reversal(contact),
     )
     return pictures
 
 
-def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
-    return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
-
-
-def _measure_speed(progress: UpdateProgress) -> Values:
+def _measure_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
-    cost = cpu_seconds(
+    cost = cpu_time_per_simulated_second(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
     )
     return {
@@ -153,7 +151,7 @@ def _measure_speed(progress: UpdateProgress) -> Values:
 def _write_results(
     out: Path,
     seed: int,
-    summary: Values,
+    summary: NamedValues,
     load: LoadIdentification,
     runs: tuple[FreeMotion, FreeMotion, ContactMotion],
     pictures: dict[str, Figure],
@@ -164,8 +162,12 @@ def _write_results(
         ("identification", load.result, identification_scenario(force.scenario, seed)),
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
-        ("contact_transition", contact.touched, contact.scenario),
-        ("contact_transition_without_sheet", contact.free, without_leaf_spring(contact.scenario)),
+        ("contact_transition", contact.contact_result, contact.scenario),
+        (
+            "contact_transition_without_sheet",
+            contact.free_result,
+            without_leaf_spring(contact.scenario),
+        ),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
@@ -173,29 +175,27 @@ def _write_results(
     load.identification.save(out / "identification.json")
     for name, picture in pictures.items():
         write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
-    write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_FACTOR)
-    figures = values_by_full_name(summary)
-    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
-    write_report(
-        out / "report.html",
-        setup=_describe_setup(seed, force.scenario, load),
-        summary=figures,
-        figures=_captioned_figures(out, figures),
-        parameters=parameter_rows(
-            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
-        ),
-        replay="replay.html",
+    write_replay(
+        out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
     )
-
-
-def _captioned_figures(out: Path, figures: Values) -> list[ReportFigure]:
+    figures = values_by_full_name(summary)
+    captions = figure_captions(figures)
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
         "fig8": "Fig. 8: contact transition",
     }
-    words = figure_captions(figures)
-    return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
+    write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
+    write_report(
+        out / "report.html",
+        setup=_describe_setup(seed, force.scenario, load),
+        summary=figures,
+        figures=[(titles[name], out / f"{name}.png", captions[name]) for name in titles],
+        parameters=parameter_rows(
+            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
+        ),
+        replay="replay.html",
+    )
 
 
 def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
@@ -221,8 +221,8 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
 def _markdown_table(rows: list[Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
-        f"| {row.accepted or '–'} | {row.verdict} |"
+        f"| {row.quantity.replace('|', '&#124;')} | {row.paper_value} | {row.reproduced_value} "
+        f"| {row.set_or_found} | {row.accepted_range or '–'} | {row.verdict} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
@@ -242,7 +242,9 @@ def _print_comparison(rows: list[Comparison], out: Path) -> None:
     colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
         verdict = f"[{colours[row.css_class]}]{row.verdict}[/]"
-        table.add_row(row.what, row.paper, row.ours, row.origin, verdict)
+        table.add_row(
+            row.quantity, row.paper_value, row.reproduced_value, row.set_or_found, verdict
+        )
     console = Console()
     console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -15,17 +15,13 @@ from drake_teleop.station.simulation import MakeSimulator, advance_without_garba
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_MEASURED_TIME_S = 0.1  # simulated time of one measurement [s]
+_NUM_REPETITIONS, _MEASURED_TIME_S = 11, 0.1  # simulated time of one measurement [s]
 
 
-def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
-    """Return a simulator of arm and tool under constant holding torque.
-
-    `touching=True` adds the scenario's environment.
-    """
+def MakeBarePlant(scenario: Scenario) -> Simulator:
+    """Return a simulator of arm and tool under constant holding torque."""
     builder = DiagramBuilder()
-    surroundings = scenario.surroundings if touching else None
-    slave = AddSlavePlant(builder, scenario.slave, surroundings)
+    slave = AddSlavePlant(builder, scenario.slave, None)
     diagram = builder.Build()
     step = 1 / scenario.rates.sensor_hz
     simulation = Simulation(integrator="runge_kutta2", max_step=step)
@@ -48,20 +44,17 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
     return simulator
 
 
-def cpu_seconds(
-    simulators: Mapping[str, Simulator],
-    *,
-    repetitions: int = 11,
-    progress: UpdateProgress = lambda done: None,
+def cpu_time_per_simulated_second(
+    simulators: Mapping[str, Simulator], *, progress: UpdateProgress = lambda done: None
 ) -> dict[str, float]:
     """Return the least CPU time per simulated second of each simulator."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
-    for k in range(repetitions):
+    for k in range(_NUM_REPETITIONS):
         for name, simulator in simulators.items():
             start = time.thread_time()
             advance_without_garbage_collection(
                 simulator, simulator.get_context().get_time() + _MEASURED_TIME_S
             )
             times_s[name].append((time.thread_time() - start) / _MEASURED_TIME_S)
-        progress((k + 1) / repetitions)
+        progress((k + 1) / _NUM_REPETITIONS)
     return {name: min(times) for name, times in times_s.items()}

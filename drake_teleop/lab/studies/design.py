@@ -13,17 +13,17 @@ from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.measures import MEASURES, default_measures
 
-Value: TypeAlias = float | str | bool | list[float]
-Values: TypeAlias = dict[str, Value]
+FactorValue: TypeAlias = float | str | bool | list[float]
+FactorValues: TypeAlias = dict[str, FactorValue]
 """Values of the factors at one point, by field."""
 
-MANY_RUNS = 10**5
+MAX_RUNS_WITHOUT_CONSENT = 10**5
 """Number of runs above which a study takes days or weeks and requires consent."""
 MAX_RUNS = 10**6
 """Maximum number of runs; their design needs 1 GB of memory."""
 
 # Number of candidates of an adaptive design (a power of two).
-_NUM_CANDIDATES = 1024
+_NUM_ADAPTIVE_CANDIDATES = 1024
 
 
 @settings
@@ -40,20 +40,20 @@ class Factor:
     high: float | None = plain(None, "end of the range")
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
-    def level_values(self) -> Sequence[Value]:
+    def level_values(self) -> Sequence[FactorValue]:
         """Return the listed values, or `levels` numbers of the range."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
 
-    def value_at_share(self, share: float) -> Value:
+    def value_at_share(self, share: float) -> FactorValue:
         """Return the value at a share (0 to 1) of the range or the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()
         return listed[int(share * len(listed))]
 
-    def coordinates(self, value: Value) -> list[float]:
+    def coordinates(self, value: FactorValue) -> list[float]:
         """Return a number from 0 to 1, or an indicator (0 or 1) for each word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
@@ -161,25 +161,25 @@ class Study:
                 remedy="give one of the measures for an adaptive design, none for others",
             )
 
-    def size(self) -> int:
+    def num_points(self) -> int:
         if self.design == "factorial":
             return math.prod(len(factor.level_values()) for factor in self.factors)
         return self.samples
 
-    def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise an error above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`)."""
-        runs = self.size() * self.repeats
+    def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
+        """Raise above `MAX_RUNS` runs, or above `MAX_RUNS_WITHOUT_CONSENT` unless `yes`."""
+        runs = self.num_points() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
             what = f"{what} are too many (at most {MAX_RUNS:,})"
             raise DrakeTeleopError(what, where=where, remedy="give fewer values or repeats")
-        if runs <= MANY_RUNS or yes is True:
+        if runs <= MAX_RUNS_WITHOUT_CONSENT or yes is True:
             return
         if yes is False or not yes(f"{where}: {what}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
             raise DrakeTeleopError(f"{what} need your consent", where=where, remedy=remedy)
 
-    def points(self) -> list[Values]:
+    def points(self) -> list[FactorValues]:
         """Return all points (field -> value); of an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
@@ -191,7 +191,7 @@ class Study:
         first = max(self.batch, 2 * (len(self.factors) + 1))
         return self._draw_sobol_points(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
-    def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
+    def next_points(self, points: Sequence[FactorValues], objective: Array) -> list[FactorValues]:
         """Return the next points of an adaptive design; an empty list at its end."""
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
@@ -200,7 +200,7 @@ class Study:
 
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
-        drawn = self._draw_sobol_points(_NUM_CANDIDATES, self.seed + len(points))
+        drawn = self._draw_sobol_points(_NUM_ADAPTIVE_CANDIDATES, self.seed + len(points))
         candidates = list(
             {str(point): point for point in drawn if str(point) not in tried}.values()
         )
@@ -211,7 +211,7 @@ class Study:
         )
         return [candidates[index] for index in chosen]
 
-    def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
+    def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
         """Return a table row (run, point, seed, values) without measures for each run."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
@@ -219,7 +219,7 @@ class Study:
             for run, ((point, values), repeat) in enumerate(order, first * self.repeats)
         ]
 
-    def _draw_sobol_points(self, count: int, seed: int) -> list[Values]:
+    def _draw_sobol_points(self, count: int, seed: int) -> list[FactorValues]:
         from scipy.stats import qmc
 
         # All SciPy versions accept a generator as `seed`.
@@ -233,7 +233,7 @@ class Study:
             for point in shares.tolist()
         ]
 
-    def _coordinates(self, points: Sequence[Values]) -> Array:
+    def _coordinates(self, points: Sequence[FactorValues]) -> Array:
         rows = [
             list(itertools.chain(*(f.coordinates(point[f.field]) for f in self.factors)))
             for point in points

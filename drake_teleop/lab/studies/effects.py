@@ -39,12 +39,12 @@ class Factorial:
     Attributes:
         levels: for each factor, the level (n,) of each point.
         counts: number of levels of each factor.
-        seen: (n, seeds) True where a point has a value with a seed.
+        has_value: (n, seeds) True where a point has a value with a seed.
     """
 
     levels: list[NDArray[np.int64]]
     counts: list[int]
-    seen: BooleanArray
+    has_value: BooleanArray
 
     def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
@@ -71,26 +71,26 @@ class Factorial:
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        mean, half = seed_interval(weights @ table)
-        return mean, np.hypot(half, self._missing_seed_widths(table, weights))
+        mean, half = means_and_half_widths_over_seeds(weights @ table)
+        return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
     def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-        place, count = np.zeros(len(self.seen), dtype=np.int64), 1
+        place, count = np.zeros(len(self.has_value), dtype=np.int64), 1
         for factor in factors:
             place = place * self.counts[factor] + self.levels[factor]
             count *= self.counts[factor]
         return place, count
 
-    def _missing_seed_widths(self, table: Array, weights: Array) -> Array:
+    def _half_widths_of_missing_seeds(self, table: Array, weights: Array) -> Array:
         points, seeds = table.shape
-        runs = self.seen.sum(axis=1)
+        runs = self.has_value.sum(axis=1)
         freedom = runs.sum() - points - seeds + 1
         if (runs == seeds).all():
             return np.zeros(len(weights))
         # Least squares for points and zero-sum seeds; points are eliminated (Schur complement).
         zero_sum = np.vstack([np.eye(seeds - 1), -np.ones((1, seeds - 1))])
-        seen = self.seen @ zero_sum
-        left = (zero_sum.T * self.seen.sum(axis=0)) @ zero_sum - (seen.T / runs) @ seen
+        seen = self.has_value @ zero_sum
+        left = (zero_sum.T * self.has_value.sum(axis=0)) @ zero_sum - (seen.T / runs) @ seen
         if freedom < 1 or np.linalg.matrix_rank(left) < seeds - 1:
             return np.where((weights[:, runs < seeds] != 0).any(axis=1), np.nan, 0.0)
         moved = (weights / runs) @ seen
@@ -103,7 +103,7 @@ class Factorial:
         return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
 
 
-def fill_missing(values: Array) -> Array:
+def fill_missing_values(values: Array) -> Array:
     """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
     known = np.isfinite(values)
     if known.all():
@@ -115,7 +115,7 @@ def fill_missing(values: Array) -> Array:
     return np.where(known, values, of_point[:, None] + of_seed)
 
 
-def seed_interval(table: Array) -> tuple[Array, Array]:
+def means_and_half_widths_over_seeds(table: Array) -> tuple[Array, Array]:
     """Return means (n,) over the seeds of a table (n, seeds), and half widths; nan is ignored."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -131,17 +131,17 @@ PARETO_MEASURES = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MeanEstimate:
     """Means over seeds at n levels.
 
     Attributes:
-        mean, half: (n,) mean and half width of its interval.
-        effect_half: (n,) half width of the difference from the mean of all n levels.
+        mean, half_width: (n,) mean and half width of its interval.
+        effect_half_width: (n,) half width of the difference from the mean of all n levels.
     """
 
     mean: Array
-    half: Array
-    effect_half: Array
+    half_width: Array
+    effect_half_width: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,25 +149,26 @@ class MainEffect:
     """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: labels of the n levels, or of the n sections of a range.
-        runs: (n,) number of runs with the measure.
-        mean, half: (n,) mean over other factors and seeds, and its half width.
-        effect, effect_half: (n,) difference from the mean of all levels, and its half width.
-        why: (n,) reason of a missing value.
-        compared, left_out: number of used and unused combinations of other levels.
-        fitted: True if the values are from a regression.
+        level_names: labels of the n levels, or of the n sections of a range.
+        num_runs: (n,) number of runs with the measure.
+        mean, half_width: (n,) mean over other factors and seeds, and its half width.
+        effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
+        missing_reasons: (n,) reason of a missing value.
+        num_used_combinations: number of combinations of other levels that are used.
+        num_unused_combinations: number of the other ones.
+        is_fitted: True if the values are from a regression.
     """
 
-    names: list[str]
-    runs: NDArray[np.int64]
+    level_names: list[str]
+    num_runs: NDArray[np.int64]
     mean: Array
-    half: Array
+    half_width: Array
     effect: Array
-    effect_half: Array
-    why: list[str]
-    compared: int
-    left_out: int
-    fitted: bool
+    effect_half_width: Array
+    missing_reasons: list[str]
+    num_used_combinations: int
+    num_unused_combinations: int
+    is_fitted: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,22 +177,22 @@ class PairMeans:
 
     Attributes:
         mean: (n, m) means over other factors and seeds; nan if not comparable.
-        why: (n, m) reason of a missing value.
-        compared, left_out, fitted: see `MainEffect`.
+        missing_reasons: (n, m) reason of a missing value.
+        num_used_combinations, num_unused_combinations, is_fitted: see `MainEffect`.
     """
 
     fields: tuple[str, str]
-    names: tuple[list[str], list[str]]
+    level_names: tuple[list[str], list[str]]
     mean: Array
-    why: NDArray[Any]
-    compared: int
-    left_out: int
-    fitted: bool
+    missing_reasons: NDArray[Any]
+    num_used_combinations: int
+    num_unused_combinations: int
+    is_fitted: bool
 
 
 def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
-) -> Estimate:
+) -> MeanEstimate:
     """Return the means over seeds of values (N,) at `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
@@ -200,10 +201,10 @@ def estimate_means(
     np.add.at(runs, (levels[known], seed[known]), 1.0)
     with np.errstate(invalid="ignore"):
         table = sums / runs
-    mean, half = seed_interval(table)
+    mean, half = means_and_half_widths_over_seeds(table)
     # Seeds without some level are excluded: they would shift all other levels.
-    _, effect_half = seed_interval(table - table.mean(axis=0))
-    return Estimate(mean, half, effect_half)
+    _, effect_half = means_and_half_widths_over_seeds(table - table.mean(axis=0))
+    return MeanEstimate(mean, half, effect_half)
 
 
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
@@ -215,18 +216,18 @@ def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
             "measure": measure,
             "factor": field,
             "level": name,
-            "runs": int(found.runs[index]),
+            "runs": int(found.num_runs[index]),
             "mean": found.mean[index],
-            "mean_half": found.half[index],
+            "mean_half": found.half_width[index],
             "effect": found.effect[index],
-            "effect_half": found.effect_half[index],
-            "combinations": found.compared,
-            "left_out": found.left_out,
-            "why": found.why[index] or None,
+            "effect_half": found.effect_half_width[index],
+            "combinations": found.num_used_combinations,
+            "left_out": found.num_unused_combinations,
+            "why": found.missing_reasons[index] or None,
         }
         for measure in study.measures
         for field, found in main_effects(study, rows, measure).items()
-        for index, name in enumerate(found.names)
+        for index, name in enumerate(found.level_names)
     ]
     return pl.DataFrame(table)
 
@@ -255,7 +256,7 @@ class _MeasureData:
         if self.is_empty:
             return
         used = np.ix_(known, seen.any(axis=0))
-        self.table = fill_missing(values[used])
+        self.table = fill_missing_values(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [
             levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)
@@ -287,7 +288,7 @@ class _MeasureData:
         left_out = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
             levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
-            self.fitted,
+            self.is_fitted,
         )  # fmt: skip
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
@@ -307,10 +308,12 @@ class _MeasureData:
         left_out = self._count_combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
         names = a.names, b.names
-        return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
+        return PairMeans(
+            fields, names, mean.reshape(shape), why, compared, left_out, self.is_fitted
+        )
 
     @property
-    def fitted(self) -> bool:
+    def is_fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
     def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
@@ -347,7 +350,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
         complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
         found = estimate_means(values, index, seeds, len(order))
         points = points.with_columns(
-            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half)
+            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half_width)
         )
         means.append(found.mean)
     return points.with_columns(

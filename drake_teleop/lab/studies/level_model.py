@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.studies.design import Factor, Value
+from drake_teleop.lab.studies.design import Factor, FactorValue
 
 BooleanArray: TypeAlias = NDArray[np.bool_]
 
@@ -49,7 +49,10 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
+_MODEL_VARIANTS = (
+    *((parts, True) for parts in (5, 4, 3)),
+    *((parts, False) for parts in (5, 4, 3, 2)),
+)
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_COMBINATIONS = 50_000
 
@@ -64,17 +67,19 @@ class Levels:
         within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
         centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
             one.
-        middles: (levels, k) these columns at the middle of each level.
+        middle_columns: (levels, k) these columns at the middle of each level.
     """
 
     index: NDArray[np.int64]
     names: list[str]
     within: Array | None
     centred: Array
-    middles: Array
+    middle_columns: Array
 
 
-def levels_of_factor_values(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
+def levels_of_factor_values(
+    factor: Factor, column: Sequence[FactorValue], parts: int = 5
+) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.level_values()
     places = np.array([factor.coordinates(value) for value in column])
@@ -104,7 +109,7 @@ class LevelModel:
         products: columns of X for each pair (i, j) of factors.
         failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
         X: (n, p) design matrix; first column: the mean.
-        solve: (p, n) pseudo-inverse of X.
+        pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
     factors: list[Levels]
@@ -112,7 +117,7 @@ class LevelModel:
     products: dict[tuple[int, int], slice]
     failed: dict[tuple[int, int], BooleanArray]
     X: Array
-    solve: Array
+    pseudo_inverse: Array
 
     def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `Factorial`, but with a matrix from coefficients to means."""
@@ -134,7 +139,7 @@ class LevelModel:
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
         coefficients, design = (
-            self.solve @ table.mean(axis=1),
+            self.pseudo_inverse @ table.mean(axis=1),
             self._half_width_over_points(table, num_effects),
         )
         effects, halves = [], []
@@ -151,7 +156,7 @@ class LevelModel:
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
         seeds = table.shape[1]
-        each = terms @ self.solve @ table
+        each = terms @ self.pseudo_inverse @ table
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
@@ -169,7 +174,7 @@ class LevelModel:
             first += codes.shape[1]
         for (i, j), columns in self.products.items():
             if i in at and j in at:
-                a, b = self.factors[i].middles[at[i]], self.factors[j].middles[at[j]]
+                a, b = (self.factors[k].middle_columns[at[k]] for k in (i, j))
                 terms[:, columns] = _column_products(a, b)
         return terms
 
@@ -178,13 +183,13 @@ class LevelModel:
         return self.X.shape[0] - self.X.shape[1]
 
     def _residual_variance(self, table: Array, columns: int) -> float:
-        residuals = table - self.X @ (self.solve @ table)
+        residuals = table - self.X @ (self.pseudo_inverse @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
 
     def _relative_deviations(self, terms: Array) -> Array:
-        return np.linalg.norm(terms @ self.solve, axis=1)
+        return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, together: int) -> float:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
@@ -195,7 +200,7 @@ class LevelModel:
         if seeds == 1:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
-        moved = np.sum((terms @ self.solve @ apart) ** 2) / (seeds - 1)
+        moved = np.sum((terms @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
         noise = self._residual_variance(apart, seeds - 1) * np.sum(
             self._relative_deviations(terms) ** 2
         )
@@ -205,7 +210,7 @@ class LevelModel:
 
 def fit_level_model(
     factors: Sequence[Factor],
-    columns: Sequence[Sequence[Value]],
+    columns: Sequence[Sequence[FactorValue]],
     known: BooleanArray | None = None,
     *,
     by_chance: bool = True,
@@ -216,7 +221,7 @@ def fit_level_model(
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _MODELS:
+    for parts, products in _MODEL_VARIANTS:
         levels = [
             levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
         ]
@@ -286,5 +291,5 @@ def _student_quantile(together: int, freedom: int) -> float:
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / together))
 
 
-def _format_value(value: Value) -> str:
+def _format_value(value: FactorValue) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

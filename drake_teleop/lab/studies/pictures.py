@@ -34,8 +34,8 @@ from drake_teleop.lab.studies.level_model import (
 if TYPE_CHECKING:
     import polars as pl
 
-_MAX_LABELS = 24  # largest number of labelled points
-_MAX_LABEL_LETTERS = 24  # letters that fit below a picture
+_MAX_LABELLED_POINTS = 24  # largest number of labelled points
+_MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
 _HATCH_OF_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
@@ -69,8 +69,8 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
                 _draw_levels(axes, found[factor.field])
-                fitted |= found[factor.field].fitted
-                reasons |= set(found[factor.field].why)
+                fitted |= found[factor.field].is_fitted
+                reasons |= set(found[factor.field].missing_reasons)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
             line[0].set_ylabel("\n".join(words).replace(" ", ""), fontsize=7)
         for axes, factor in zip(grid[-1], factors, strict=True):
@@ -81,17 +81,17 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
 
 
 def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
-    place = np.arange(len(found.names))
-    bars = np.nan_to_num(found.effect_half)
+    place = np.arange(len(found.level_names))
+    bars = np.nan_to_num(found.effect_half_width)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    _label_levels(axes, found.names)
+    _label_levels(axes, found.level_names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched_cell(found.why[level], (level - 0.5, 0.0))
+        bar = _hatched_cell(found.missing_reasons[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
-        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.why else ""
+        words = TOO_FEW_POINTS if TOO_FEW_POINTS in found.missing_reasons else ""
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
@@ -100,15 +100,16 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
 
 def _label_levels(axes: Axes, levels: list[str]) -> None:
     axes.set_xticks(range(len(levels)), levels)
-    if len("".join(levels)) > _MAX_LABEL_LETTERS:
+    if len("".join(levels)) > _MAX_UNROTATED_LABEL_LETTERS:
         for label in axes.get_xticklabels():
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
 
 def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    if not found.left_out:
+    if not found.num_unused_combinations:
         return ""
-    return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
+    used, unused = found.num_used_combinations, found.num_unused_combinations
+    return f"over {used} of {used + unused} combinations of the rest"
 
 
 def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
@@ -135,19 +136,21 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
-                axes.add_patch(_hatched_cell(found.why[row, column], (column - 0.5, row - 0.5)))
+                axes.add_patch(
+                    _hatched_cell(found.missing_reasons[row, column], (column - 0.5, row - 0.5))
+                )
             axes.grid(False)
-            _label_levels(axes, found.names[1])
-            axes.set_yticks(range(len(found.names[0])), found.names[0])
+            _label_levels(axes, found.level_names[1])
+            axes.set_yticks(range(len(found.level_names[0])), found.level_names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
             axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
-        words = ", fitted: levels of each, and products" if maps[0].fitted else ""
+        words = ", fitted: levels of each, and products" if maps[0].is_fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
-        _draw_reason_legend(figure, set().union(*(found.why.ravel() for found in maps)))
+        _draw_reason_legend(figure, set().union(*(found.missing_reasons.ravel() for found in maps)))
     return figure
 
 
@@ -163,10 +166,10 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO_MEASURES[1:], strict=True):
             axes.plot(points[name], points[PARETO_MEASURES[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _draw_pareto_bars(axes, on_front, name)
+            _draw_pareto_intervals(axes, on_front, name)
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO_MEASURES[0])
-        if on_front.height <= _MAX_LABELS:
+        if on_front.height <= _MAX_LABELLED_POINTS:
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
                 for axes, name in zip(figure.axes, PARETO_MEASURES[1:], strict=True):
                     axes.annotate(str(place), (point[name], point[PARETO_MEASURES[0]]), (4, 4),
@@ -184,7 +187,7 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     return figure
 
 
-def _draw_pareto_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+def _draw_pareto_intervals(axes: Axes, points: pl.DataFrame, name: str) -> None:
     half = [np.nan_to_num(points[f"{key}_half"].to_numpy()) for key in (name, PARETO_MEASURES[0])]
     axes.errorbar(
         points[name], points[PARETO_MEASURES[0]], half[1], half[0],

@@ -27,14 +27,14 @@ RunRows: TypeAlias = Callable[[Chunk], Chunk]
 
 @dataclass(frozen=True)
 class RunExecutor:
-    """Executor of `count` runs at once; `rows_of` yields finished chunks (groups of rows)."""
+    """Executor of `num_workers` runs at once; `run_chunks` yields finished chunks."""
 
-    count: int
-    rows_of: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
+    num_workers: int
+    run_chunks: Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 
 
 PROCESS_ENDED_ERROR = "the run has ended its process"
-_PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
+_PARENT_CHECK_PERIOD_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def open_executor(
             )
         yield RunExecutor(
             getattr(executor, "_max_workers", max(jobs, 1)),
-            lambda run, chunks: _run_by_executor(run, chunks, executor),
+            lambda run, chunks: _run_on_custom_executor(run, chunks, executor),
         )
         return
     if cluster is None:
@@ -78,7 +78,7 @@ def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int)
         marked = store.chunks_started_at_least(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
-                yield _run_rows_alone(run, chunk, store)
+                yield _run_rows_one_by_one(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
@@ -118,7 +118,7 @@ def _delayed_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
     return delayed(_run_and_count_start)(run, chunk, store)
 
 
-def _run_rows_alone(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
+def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     found = []
     for row in chunk:
         try:
@@ -141,7 +141,7 @@ def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
 def _exit_when_parent_ends(parent: int) -> None:
     def wait_for_parent() -> None:
         while os.getppid() == parent:
-            time.sleep(_PARENT_CHECK_S)
+            time.sleep(_PARENT_CHECK_PERIOD_S)
         os._exit(1)
 
     threading.Thread(target=wait_for_parent, daemon=True).start()
@@ -180,7 +180,9 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _run_by_executor(run: RunRows, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
+def _run_on_custom_executor(
+    run: RunRows, chunks: Sequence[Chunk], executor: Executor
+) -> Iterator[Chunk]:
     futures = [executor.submit(run, chunk) for chunk in chunks]
     try:
         for future in as_completed(futures):

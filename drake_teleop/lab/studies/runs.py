@@ -20,7 +20,7 @@ from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.common.version import __version__
-from drake_teleop.lab.studies.design import Study, Values
+from drake_teleop.lab.studies.design import FactorValues, Study
 from drake_teleop.lab.studies.processes import Chunk, open_executor
 from drake_teleop.lab.studies.shards import merge_shards, parse_shard
 from drake_teleop.lab.studies.store import Store, open_store
@@ -28,18 +28,18 @@ from drake_teleop.lab.studies.store import Store, open_store
 if TYPE_CHECKING:
     import polars as pl
 
-Work: TypeAlias = Callable[[Values, int], dict[str, float]]
-"""Function from factor values and seed to the run's measures and, optionally, `ONE_TIME_COST`."""
+RunFunction: TypeAlias = Callable[[FactorValues, int], dict[str, float]]
+"""Function from factor values and seed to the run's measures; `ONE_TIME_COST_KEY` is optional."""
 
-ONE_TIME_COST = "seconds_once"
+ONE_TIME_COST_KEY = "seconds_once"
 """Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
 _RUN_TIME_KEY = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
 _MAX_RUNS_PER_CHUNK = 8
-_NUM_CHUNKS = 512
-_NUM_SINGLE_RUNS = 64
+_TARGET_NUM_CHUNKS = 512
+_NUM_SINGLE_RUN_CHUNKS = 64
 # Number of latest runs for the estimate of the remaining time.
 _NUM_RECENT_RUNS = 16
 
@@ -47,7 +47,7 @@ _NUM_RECENT_RUNS = 16
 def run_study(
     study: Study,
     out: Path,
-    work: Work,
+    work: RunFunction,
     basis: dict[str, Any],
     *,
     jobs: int = -1,
@@ -62,6 +62,8 @@ def run_study(
     `basis` is JSON data of all inputs of the rows besides the study. `shard` "K/N" restricts runs
     and rows to this shard; `merge` collects the rows of all shards and runs nothing.
     """
+    import polars as pl
+
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":
         raise DrakeTeleopError(
@@ -73,7 +75,7 @@ def run_study(
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
+    identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
     schema = _table_schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = (
@@ -81,7 +83,7 @@ def run_study(
         if part is None
         else part.chunks(_group_into_chunks(first_rows))
     )
-    total = sum(map(len, chunks)) if part else study.size() * study.repeats
+    total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
         if merge:
             merge_shards(out, store, identity, chunks)
@@ -91,14 +93,15 @@ def run_study(
                 show_progress(progress) as stage,
                 open_executor(store, jobs, cluster, executor) as workers,
             ):
-                counter.start(stage("Study"), workers.count)
+                counter.start(stage("Study"), workers.num_workers)
                 new = points
                 while new:
                     finished = store.finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
-                    for found in workers.rows_of(run, left):
-                        _store_rows(store, found, schema)
+                    for found in workers.run_chunks(run, left):
+                        columns = {name: [row.get(name) for row in found] for name in schema}
+                        store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
                     new = study.next_points(points, _objective_of_points(study, store, len(points)))
                     chunks = _group_into_chunks(study.rows(new, len(points)))
@@ -112,9 +115,11 @@ def run_study(
 
 
 def _group_into_chunks(rows: Chunk) -> list[Chunk]:
-    size = min(max(len(rows) // _NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
-    chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
-    chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
+    size = min(max(len(rows) // _TARGET_NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
+    chunks = [[row] for row in rows[:_NUM_SINGLE_RUN_CHUNKS]]
+    chunks += [
+        rows[first : first + size] for first in range(_NUM_SINGLE_RUN_CHUNKS, len(rows), size)
+    ]
     return chunks
 
 
@@ -149,7 +154,7 @@ class StudyProgress:
         for row in rows:
             if _RUN_TIME_KEY in row:  # missing if the run ended its process
                 first = self._num_timed < _NUM_RECENT_RUNS
-                self._recent.append(row[_RUN_TIME_KEY] - first * row.get(ONE_TIME_COST, 0.0))
+                self._recent.append(row[_RUN_TIME_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
                 self._num_timed += 1
         self._report_progress()
 
@@ -169,7 +174,7 @@ def _format_duration(seconds: float) -> str:
 
 
 def _run_chunk(
-    work: Work, names: Sequence[str], rows: Sequence[dict[str, Any]]
+    work: RunFunction, names: Sequence[str], rows: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
     found = []
     with one_blas_thread():
@@ -185,13 +190,6 @@ def _run_chunk(
             # Not stored in the table, which must be reproducible.
             found.append(row | measures | {_RUN_TIME_KEY: time.monotonic() - start})
     return found
-
-
-def _store_rows(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
-    import polars as pl
-
-    columns = {name: [row.get(name) for row in rows] for name in schema}
-    store.write(pl.DataFrame(columns, schema=schema))
 
 
 def _table_schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:

@@ -36,10 +36,14 @@ if TYPE_CHECKING:
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
 CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
-TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
+TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
+    ("touch", "press", "insert"), tuple(CRITERIA)
+)
 """Criteria of each task; free reaching has no contact."""
-_OBJECT_STUDY_NAME = "scaling_object"
-_SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
+_ETA_STUDY_NAME = "scaling_object"
+_SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
+    f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
+)
 _NUM_DRAWS, _SEED = 2000, 0
 _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
@@ -50,16 +54,16 @@ class ScaleRating:
 
     Attributes:
         merit: mean relative criterion, below 1 is better; nan with too many failures.
-        low, high: limits of the merit's 95 % interval.
-        best: share of bootstrap draws in which the point is the best.
-        failures: share of failed runs in the worst task.
+        merit_low, merit_high: limits of the merit's 95 % interval.
+        best_share: share of bootstrap draws in which the point is the best.
+        failure_share: share of failed runs in the worst task.
     """
 
     merit: Array
-    low: Array
-    high: Array
-    best: Array
-    failures: Array
+    merit_low: Array
+    merit_high: Array
+    best_share: Array
+    failure_share: Array
 
 
 def scaling_study_command(
@@ -75,13 +79,13 @@ def scaling_study_command(
     """Run the missing runs of the scaling studies; write results; return answer.json's content."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY_NAME):
+    for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASKS}
+    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     sigmas, gammas = _scale_axes()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
@@ -91,7 +95,7 @@ def scaling_study_command(
         "choice": {
             selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
         },
-        "eta": _eta_effects(rows[_OBJECT_STUDY_NAME]),
+        "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
     with output_folder(out, "answer.json"):
         write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
@@ -106,7 +110,7 @@ def scaling_study_command(
 def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
-    counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
+    counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
     draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
@@ -136,23 +140,19 @@ def _relative_means(table: Array, weights: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
         means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
-    return means / means[:, -1, _index_of_gamma_1(), None, None]
+    return means / means[:, -1, _scale_axes()[1].index(1.0), None, None]  # sigma = gamma = 1
 
 
 def _scale_axes() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
-    return factors[_SIGMA], factors[_GAMMA]
-
-
-def _index_of_gamma_1() -> int:
-    return _scale_axes()[1].index(1.0)
+    return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
 
 
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _scale_axes()
     seeds = rows["seed"].n_unique()
-    count = len(gammas) if _GAMMA in rows.columns else 1
-    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASKS[task]}
+    count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
+    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
         values = measure_values(rows, measure)
@@ -169,15 +169,15 @@ def _best_scales(
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best >= _MIN_BEST_SHARE)
+    near = np.argwhere(found.best_share >= _MIN_BEST_SHARE)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
         "merit": found.merit[s, g],
-        "interval": [found.low[s, g], found.high[s, g]],
-        "best_in": found.best[s, g],
+        "interval": [found.merit_low[s, g], found.merit_high[s, g]],
+        "best_in": found.best_share[s, g],
         "others": [
-            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best[i, j]}
+            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best_share[i, j]}
             for i, j in near
             if (i, j) != (s, g)
         ],
@@ -196,9 +196,9 @@ def _merit_table(
                 "sigma": sigma,
                 "gamma": gamma,
                 "merit": found.merit[i, j],
-                "low": found.low[i, j],
-                "high": found.high[i, j],
-                "best_in": found.best[i, j],
+                "low": found.merit_low[i, j],
+                "high": found.merit_high[i, j],
+                "best_in": found.best_share[i, j],
             }
             for selection, found in answers.items()
             for i, sigma in enumerate(sigmas)
@@ -208,14 +208,14 @@ def _merit_table(
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    etas = sorted(rows[_ETA].unique().to_list())
-    levels = np.array([etas.index(value) for value in rows[_ETA]])
+    etas = sorted(rows[_ETA_FIELD].unique().to_list())
+    levels = np.array([etas.index(value) for value in rows[_ETA_FIELD]])
     seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
         found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
         for index, row in enumerate(table):
-            figures = (found.mean[index], found.half[index], found.effect_half[index])
+            figures = (found.mean[index], found.half_width[index], found.effect_half_width[index])
             names = (measure, f"{measure}_half", f"{measure}_effect_half")
             row |= {n: v if np.isfinite(v) else None for n, v in zip(names, figures, strict=True)}
     return table
@@ -224,7 +224,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def draw_criteria(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    tasks = [task for task in TASKS if "force" in TASKS[task]]
+    tasks = [task for task in TASK_CRITERIA if "force" in TASK_CRITERIA[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(len(tasks), 3, sharex=True)
@@ -235,7 +235,9 @@ def draw_criteria(
                 found = estimate_means(
                     measure_values(table, measure), levels, seeds, levels.max() + 1
                 )
-                means, bars = (a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half))
+                means, bars = (
+                    a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half_width)
+                )
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
                         sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],
@@ -286,8 +288,8 @@ def draw_best_scales(
 
 def _cell_text(found: ScaleRating, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
-        return f"{found.failures[i, j]:.0%} fail"
-    best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""
+        return f"{found.failure_share[i, j]:.0%} fail"
+    best = f"\nbest: {found.best_share[i, j]:.0%}" if found.best_share[i, j] >= 0.005 else ""
     return f"{found.merit[i, j]:.2f}{best}"
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import whole_file
 from drake_teleop.lab.studies.processes import Chunk
-from drake_teleop.lab.studies.store import Store, check_identity
+from drake_teleop.lab.studies.store import Store, write_or_check_identity
 
 _SHARD_FOLDER_PATTERN = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
 _MAX_LISTED_SHARDS = 20
@@ -58,7 +58,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         raise DrakeTeleopError("has no shards", where=str(out), remedy="run study --shard K/N")
     for shard in sorted(shards):
         folder = shard.folder(out)
-        check_identity(folder, identity)
+        write_or_check_identity(folder, identity)
         for part in Store(folder / "runs.parquet").part_files():
             _link_or_copy_file(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()

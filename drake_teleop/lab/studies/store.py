@@ -32,7 +32,7 @@ class Store:
 
     def finished_chunks(self) -> set[int]:
         """Return the first run of each stored chunk."""
-        return set(map(_first_run, self.part_files()))
+        return set(map(_first_run_of_part, self.part_files()))
 
     def part_files(self) -> list[Path]:
         """Return the files of the stored chunks, sorted by run."""
@@ -40,9 +40,9 @@ class Store:
 
     def remove_damaged_parts(self) -> None:
         parts = self.part_files()
-        whole = _read_runs(parts)
+        whole = _read_run_numbers(parts)
         for part in parts:
-            if not {_first_run(part)} & (whole or _read_runs([part])):
+            if not {_first_run_of_part(part)} & (whole or _read_run_numbers([part])):
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
@@ -81,11 +81,11 @@ class Store:
             return pl.read_parquet(parts).sort("run")
 
 
-def _first_run(part: Path) -> int:
+def _first_run_of_part(part: Path) -> int:
     return int(part.stem.removeprefix("run_"))
 
 
-def _read_runs(parts: list[Path]) -> set[int]:
+def _read_run_numbers(parts: list[Path]) -> set[int]:
     import polars as pl
 
     if parts:
@@ -116,23 +116,19 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:
-        _lock_folder(handle, out)
-        check_identity(out, identity)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DrakeTeleopError(
+                "is in use by another process", where=str(out), remedy="wait for it, or stop it"
+            ) from None
+        write_or_check_identity(out, identity)
         yield
     finally:
         os.close(handle)
 
 
-def _lock_folder(handle: int, out: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise DrakeTeleopError(
-            "is in use by another process", where=str(out), remedy="wait for it, or stop it"
-        ) from None
-
-
-def check_identity(out: Path, identity: dict[str, Any]) -> None:
+def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
     """Write the inputs of the rows into a new folder; raise an error if an old one has others."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"

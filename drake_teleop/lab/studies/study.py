@@ -15,10 +15,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
-from drake_teleop.lab.studies.design import Factor, Study, Values
+from drake_teleop.lab.studies.design import FactorValues, Study
 from drake_teleop.lab.studies.effects import effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
-from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
 from drake_teleop.lab.studies.shards import parse_shard
 from drake_teleop.station.scenario import (
     ReadScenarioData,
@@ -34,32 +34,32 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StationWork:
+class StationRunFunction:
     """Picklable function that executes one run of the station for a study.
 
     Args:
-        data: content of the base scenario's file.
-        where: name of that file, for messages.
+        scenario_data: content of the base scenario's file.
+        scenario_file: name of that file, for messages.
         measures: names of the measures.
-        threshold: force [N] of time_above_force_s.
+        force_threshold_N: force [N] of time_above_force_s.
     """
 
-    data: Any
-    where: str
+    scenario_data: Any
+    scenario_file: str
     measures: Sequence[str]
-    threshold: float
+    force_threshold_N: float
 
-    def scenario(self, values: Values, seed: int) -> Scenario:
+    def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_apply_changes(self.data, changes), self.where)
+        return ScenarioFromData(_apply_changes(self.scenario_data, changes), self.scenario_file)
 
-    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+    def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
         one_time_s = time.monotonic() - start - simulated / run.real_time_factor
-        found = evaluate_measures(run.result, scenario, self.measures, self.threshold)
-        return found | {ONE_TIME_COST: max(one_time_s, 0.0)}
+        found = evaluate_measures(run.result, scenario, self.measures, self.force_threshold_N)
+        return found | {ONE_TIME_COST_KEY: max(one_time_s, 0.0)}
 
 
 def study_command(
@@ -94,12 +94,17 @@ def study_command(
             )
     study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
-    study.check_size(str(path), yes)
-    data, where = ReadScenarioData(_scenario_path(study, path))
+    study.check_num_runs(str(path), yes)
+    known = study.scenario in ScenarioNames()
+    data, where = ReadScenarioData(study.scenario if known else path.parent / study.scenario)
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
-        _check_factor_values(factor, f"{path}:factors[{index}]")
-    work = StationWork(data, where, tuple(study.measures), study.force_threshold)
+        ranged = factor.low is not None and factor.high is not None
+        for value in (factor.low, factor.high) if ranged else factor.level_values():
+            changed = _apply_changes({}, {factor.field: value})
+            place = f"{path}:factors[{index}]"
+            check_ranges(settings_from_data(Scenario, changed, place), place)
+    work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
         study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
@@ -125,18 +130,6 @@ def LoadStudy(path: str | Path) -> Study:
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
-
-
-def _scenario_path(study: Study, path: Path) -> str | Path:
-    known = study.scenario in ScenarioNames()
-    return study.scenario if known else path.parent / study.scenario
-
-
-def _check_factor_values(factor: Factor, where: str) -> None:
-    ranged = factor.low is not None and factor.high is not None
-    for value in (factor.low, factor.high) if ranged else factor.level_values():
-        data = _apply_changes({}, {factor.field: value})
-        check_ranges(settings_from_data(Scenario, data, where), where)
 
 
 def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:

@@ -15,9 +15,9 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.analyze import sampling_of_scenario
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.figures import axis_with_grip
-from drake_teleop.lab.analysis.one_axis import Axis
+from drake_teleop.lab.analysis.one_axis import AxisParameters
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
-from drake_teleop.lab.comparison.delayed_contact import delayed_contact, station_figures
+from drake_teleop.lab.comparison.delayed_contact import delayed_contact, figures_of_station_run
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
@@ -25,7 +25,7 @@ from drake_teleop.lab.comparison.one_dof import (
     operator_intent,
     run_one_dof,
 )
-from drake_teleop.lab.studies.design import Values
+from drake_teleop.lab.studies.design import FactorValues
 from drake_teleop.lab.tuning.stated_set import StatedSet
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import PEAK_FORCE_N
@@ -43,14 +43,15 @@ MIN_RENDERED_SHARE = 0.9
 """Smallest accepted rendered force, as a share of the scaled contact force."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
-_REST_S, _JUDGED_S = 1.5, 0.8  # s, from the press to the judged time; length of that time
+_PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
-_MAX_DEPTH, _DEVICE_SHARE = 0.02, 0.6  # m; share of the device's peak force that is used
+_MAX_PRESS_DEPTH_M = 0.02
+_MAX_DEVICE_FORCE_SHARE = 0.6  # share of the device's peak force that is used
 _SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
-_MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
-_LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
-GIVEN_SETTINGS = "as given"
+_MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
+_TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
+GIVEN_SETTINGS_NAME = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
 
@@ -86,7 +87,7 @@ class Settings:
         )
 
 
-def settings_from_values(values: Values) -> Settings:
+def settings_from_values(values: FactorValues) -> Settings:
     names = [entry.name for entry in dataclasses.fields(Settings)]
     return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
@@ -96,24 +97,24 @@ class StationTrial:
     """Function that a study runs: one press in the whole station.
 
     Args:
-        given: scenario of the user, with its own passivity and scales.
+        user_scenario: scenario of the user, with its own passivity and scales.
         base: the same without environment, task and passivity method.
         estimate: (16,) load estimate.
     """
 
-    given: Scenario
+    user_scenario: Scenario
     base: Scenario
     stated: StatedSet
     estimate: Array
 
-    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+    def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
-        scenario = self.given
-        if values["method"] != GIVEN_SETTINGS:
+        scenario = self.user_scenario
+        if values["method"] != GIVEN_SETTINGS_NAME:
             scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
-        task = short_task(sum(line.delay for line in channel.networks_of_directions()))
+        task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
             channel,
@@ -128,13 +129,13 @@ class StationTrial:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
             return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
-        found = station_figures(result, setup, task)
-        hold = (result.t >= task.release - task.judged) & (result.t < task.release)
+        found = figures_of_station_run(result, setup, task)
+        hold = (result.t >= task.release_start - task.rest_window) & (result.t < task.release_start)
         scaling = scenario.force_scaling
         gain = scaling.force_scale * scaling.scales().gamma
         contact = float(result["true_contact_wrench_W"][hold, 2].mean())
         felt = result["force_to_master"][hold, 2]
-        free = (result.t >= task.swung + _HAND_SETTLE_TIME_S) & (result.t < task.press)
+        free = (result.t >= task.swing_end + _HAND_SETTLE_TIME_S) & (result.t < task.press_start)
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
@@ -158,19 +159,19 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `caps`: low-pass [Hz] -> upper bound of gamma.
+    `gamma_caps`: low-pass [Hz] -> upper bound of gamma.
     """
 
     base: Scenario
     stated: StatedSet
-    caps: dict[float, float]
+    gamma_caps: dict[float, float]
 
-    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+    def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = self.caps[settings.low_pass_hz] * self.stated.requirements.margin
+        cap = self.gamma_caps[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -187,7 +188,7 @@ class GammaSearch:
         limit = high
         if stability_sign(high) < 0:
             limit = (
-                bisect(stability_sign, low, high, xtol=_RESOLUTION)
+                bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
                 if stability_sign(low) > 0
                 else -np.inf
             )
@@ -200,26 +201,34 @@ class GammaSearch:
         sampling = sampling_of_scenario(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
-        stable = np.ones(len(_LINEAR_GAMMAS), dtype=bool)
+        stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
         for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
-            grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _LINEAR_GAMMAS}
+            grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
-        return float(_LINEAR_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
+        return float(_TESTED_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
     def share_in_one_axis(
-        self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
+        self,
+        axis: AxisParameters,
+        settings: Settings,
+        gamma: float,
+        grip: str,
+        wall: float,
+        seed: int,
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
         forward, backward = self.base.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
-        shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
+        shown = {
+            entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
+        }
         model = OneDof(**shown | {
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
         added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
-        task = short_task(forward.delay + backward.delay)
+        task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
             settings.passivity(self.stated),
@@ -229,24 +238,24 @@ class GammaSearch:
             intent=operator_intent(task),
         )
         found = figures_of_run(run, model, task)
-        hold = (run.t >= task.release - task.judged) & (run.t < task.release)
+        hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
         quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
-def short_task(round_trip: float) -> Task:
+def short_press_task(round_trip: float) -> Task:
     """Return the times of a task (swing, rest, held press) for a round trip [s]."""
     pressed = 1.8 + 2 * round_trip
-    release = pressed + _REST_S + _JUDGED_S + 2 * round_trip
+    release = pressed + _PRESS_SETTLE_TIME_S + _REST_WINDOW_S + 2 * round_trip
     return Task(
-        swing=0.1,
-        swung=0.8,
-        press=pressed - 0.5,
-        pressed=pressed,
-        release=release,
-        released=release + 0.1,
+        swing_start=0.1,
+        swing_end=0.8,
+        press_start=pressed - 0.5,
+        press_end=pressed,
+        release_start=release,
+        release_end=release + 0.1,
         end=release,
-        judged=_JUDGED_S,
+        rest_window=_REST_WINDOW_S,
     )
 
 
@@ -254,7 +263,7 @@ def press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
-    return min(_MAX_DEPTH, _DEVICE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
+    return min(_MAX_PRESS_DEPTH_M, _MAX_DEVICE_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above(x: Array, period: float, frequency: float) -> float:

@@ -15,10 +15,10 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import UpdateProgress, show_progress
-from drake_teleop.lab.studies.design import Factor, Study, Value
+from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
-    GIVEN_SETTINGS,
+    GIVEN_SETTINGS_NAME,
     MAX_REST_FORCE_N,
     MIN_RENDERED_SHARE,
     SEARCH_MEASURES,
@@ -38,7 +38,7 @@ WALL_FACTORS = (1.2, 2.0)
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
 _BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
-_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
+_MAX_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -49,17 +49,17 @@ class SearchResult:
     """Result of the search.
 
     Attributes:
-        search: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
-        given: runs of the user's settings at the stiffest wall.
-        inside: runs of the chosen settings for extreme hands and walls, gamma times margin.
-        limits: runs of the chosen settings at the stiffest wall and at stiffer ones.
+        searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
+        given_runs: runs of the user's settings at the stiffest wall.
+        corner_runs: runs of the chosen settings for extreme hands and walls, gamma times margin.
+        limit_runs: runs of the chosen settings at the stiffest wall and at stiffer ones.
     """
 
     settings: Settings
-    search: list[Row]
-    given: list[Row]
-    inside: list[Row]
-    limits: list[Row]
+    searched_settings: list[Row]
+    given_runs: list[Row]
+    corner_runs: list[Row]
+    limit_runs: list[Row]
 
 
 def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
@@ -70,13 +70,11 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_lists([GIVEN_SETTINGS], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        _study_of_settings(Settings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
         trial,
     )
     quiet = execute(
-        "noise",
-        _study_of_lists(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES),
-        trial,
+        "noise", _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]), trial
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -84,7 +82,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         low_passes += [f for f in _LOW_PASSES_HZ if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
-    caps = {f: min(_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    caps = {f: min(_MAX_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
     study = Study(
         factors=[
             Factor(field="method", words=list(CANDIDATE_METHODS)),
@@ -94,13 +92,16 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         measures=SEARCH_MEASURES,
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
-    search = [_add_threshold(row, trial, noises) for row in rows]
-    candidates = _best_of_each_method(search)
+    search = [_predict_threshold(row, trial, noises) for row in rows]
+    candidates: dict[str, Row] = {}  # the best of each method
+    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
+        if row["gamma"] > 0.0:
+            candidates.setdefault(row["method"], row)
     found: list[tuple[float, Settings, list[Row]]] = []
-    for row in candidates:
+    for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _station_limit(settings_from_values(row), trial, execute)
+        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
@@ -113,28 +114,20 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         )
     _, chosen, inside = found[0]
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
-    limits = execute("limits", _study_of_settings(dataclasses.asdict(chosen), ends, walls), trial)
+    limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
     return SearchResult(chosen, search, given, inside, limits)
 
 
-def _best_of_each_method(search: list[Row]) -> list[Row]:
-    best: dict[str, Row] = {}
-    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
-        if row["gamma"] > 0.0:
-            best.setdefault(row["method"], row)
-    return list(best.values())
-
-
-def _station_limit(
+def _find_gamma_limit_in_station(
     settings: Settings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
+    margin, ends = (trial.stated.requirements.margin, [c[0] for c in trial.stated.corners])
     hands = list(dict.fromkeys(ends))
     tries = 0
 
     def run_at_gamma(gamma: float) -> list[Row]:
         nonlocal tries
-        tried = dataclasses.asdict(settings) | {"gamma": margin * gamma}
+        tried = dataclasses.replace(settings, gamma=margin * gamma)
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
         for wall in dict.fromkeys(trial.stated.walls[::-1]):
@@ -187,9 +180,9 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _add_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
-    human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
+    human, scale = (trial.base.operator.perception, trial.base.force_scaling.force_scale)
     masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
@@ -203,33 +196,13 @@ def _rms_load_force(trial: StationTrial) -> float:
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of_settings(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
-    gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
-    return _study_of_lists(
-        [settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES
-    )
-
-
-def _study_of_lists(
-    methods: list[str],
-    gamma: float,
-    sigma: float,
-    low_pass: float,
-    hands: list[str],
-    walls: list[float],
-    measures: list[str],
-) -> Study:
-    values: dict[str, list[Value]] = {
-        "method": [*methods],
-        "gamma": [gamma],
-        "sigma_inertia": [sigma],
-        "low_pass_hz": [low_pass],
-        "hand": [*hands],
-        "wall": [*walls],
-    }
+def _study_of_settings(settings: Settings, hands: list[str], walls: list[float]) -> Study:
     factors = [
-        Factor(field=name, words=listed) if isinstance(listed[0], str)  # type: ignore[arg-type]
-        else Factor(field=name, values=listed)  # type: ignore[arg-type]
-        for name, listed in values.items()
-    ]  # fmt: skip
-    return Study(factors=factors, measures=measures)
+        Factor(field="method", words=[settings.method]),
+        Factor(field="gamma", values=[settings.gamma]),
+        Factor(field="sigma_inertia", values=[settings.sigma_inertia]),
+        Factor(field="low_pass_hz", values=[settings.low_pass_hz]),
+        Factor(field="hand", words=hands),
+        Factor(field="wall", values=walls),
+    ]
+    return Study(factors=factors, measures=TRIAL_MEASURES)

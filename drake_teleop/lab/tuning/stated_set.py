@@ -15,12 +15,12 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 
-_MIN_WALL, _MAX_WALL = 100.0, 60e3  # N/m, range of the leaf's model
+_MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
 _MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
 
 
 @dataclass(frozen=True)
-class TunedTask:
+class TaskRequirements:
     """Requirements of a task.
 
     Args:
@@ -32,10 +32,10 @@ class TunedTask:
     min_low_pass_hz: float
 
 
-TASKS = {
-    "press": TunedTask(1.1, 50.0),
-    "touch": TunedTask(1.1, 100.0),
-    "insert": TunedTask(1.5, 50.0),
+REQUIREMENTS_OF_TASK = {
+    "press": TaskRequirements(1.1, 50.0),
+    "touch": TaskRequirements(1.1, 100.0),
+    "insert": TaskRequirements(1.5, 50.0),
 }
 """Tasks by name. A peg jams between two walls, which doubles the stiffness: a larger margin."""
 
@@ -47,7 +47,7 @@ class StatedSet:
     Args:
         hands: names of grips, softest first.
         walls: lowest and highest stiffness [N/m].
-        task: key of `TASKS`.
+        task: key of `REQUIREMENTS_OF_TASK`.
     """
 
     hands: tuple[str, ...]
@@ -61,15 +61,15 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def requirements(self) -> TunedTask:
-        return TASKS[self.task]
+    def requirements(self) -> TaskRequirements:
+        return REQUIREMENTS_OF_TASK[self.task]
 
 
-def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
+def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
     """Return the set of these grips, walls [kN/m] and this task."""
     for what, names, known in (
         ("hands", hands, tuple(GRIP_IMPEDANCES)),
-        ("task", (task,), tuple(TASKS)),
+        ("task", (task,), tuple(REQUIREMENTS_OF_TASK)),
     ):
         for name in names:
             if name not in known:
@@ -77,9 +77,9 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
                 raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
     if not hands:
         raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
-    limits = f"{_MIN_WALL / 1e3:g} to {_MAX_WALL / 1e3:g} kN/m"
+    limits = f"{_MIN_WALL_N_M / 1e3:g} to {_MAX_WALL_N_M / 1e3:g} kN/m"
     for wall in walls:
-        if not (math.isfinite(wall) and _MIN_WALL <= 1e3 * wall <= _MAX_WALL):
+        if not (math.isfinite(wall) and _MIN_WALL_N_M <= 1e3 * wall <= _MAX_WALL_N_M):
             raise DrakeTeleopError(
                 f"{wall:g} kN/m is outside {limits}",
                 where="walls",

@@ -28,7 +28,7 @@ from drake_teleop.lab.tuning.search import (
     meets_requirements,
     search_settings,
 )
-from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
+from drake_teleop.lab.tuning.stated_set import StatedSet, make_stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
@@ -64,7 +64,7 @@ def tune(
         DrakeTeleopError: for an invalid set, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
-    out, stated = Path(out), stated_set(hands, walls, task)
+    out, stated = Path(out), make_stated_set(hands, walls, task)
     base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
@@ -102,27 +102,33 @@ def tune(
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print_sentences(summary, out)
+        from rich.console import Console
+
+        console = Console()
+        for line in (*summary["sentences"], f"written to {out}; run {out / 'tuned.yaml'}"):
+            console.print(line, highlight=False, markup=False)
     return summary
 
 
 def _make_summary(
     found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
-    at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
+    at_edge = [row for row in found.limit_runs if row["wall"] <= stated.walls[1]]
     scale = tuned.force_scaling.force_scale
-    failed = [row for row in found.limits if not meets_requirements(row)]
-    worst_given = max(row["threshold_N"] for row in found.given)
+    failed = [row for row in found.limit_runs if not meets_requirements(row)]
+    worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
-        "share": min(row["share"] for row in [*found.inside, *at_edge]),
+        "share": min(row["share"] for row in [*found.corner_runs, *at_edge]),
         "threshold_N": max(row["threshold_N"] for row in at_edge),
-        "given_threshold_N": worst_given if all(map(meets_requirements, found.given)) else None,
+        "given_threshold_N": worst_given
+        if all(map(meets_requirements, found.given_runs))
+        else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
         "margin": stated.requirements.margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
         if failed
         else None,
-        "beyond_N_per_m": max(row["wall"] for row in found.limits),
+        "beyond_N_per_m": max(row["wall"] for row in found.limit_runs),
     }
     settings = dataclasses.asdict(found.settings) | {"sigma_weight": 0.0, "force_scale": scale}
     about = {
@@ -136,8 +142,8 @@ def _make_summary(
         "stated": about,
         "figures": figures,
         "sentences": _result_sentences(found.settings, figures, about, scale),
-        "search": found.search,
-        "trials": [*found.given, *found.inside, *found.limits],
+        "search": found.searched_settings,
+        "trials": [*found.given_runs, *found.corner_runs, *found.limit_runs],
     }
 
 
@@ -177,9 +183,13 @@ def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
         axes = figure.subplots()
         margins = np.geomspace(1.0, 4.0, 50)
         for colour, method in zip(
-            COLOURS, dict.fromkeys(r["method"] for r in found.search), strict=False
+            COLOURS, dict.fromkeys(r["method"] for r in found.searched_settings), strict=False
         ):
-            rows = [r for r in found.search if r["method"] == method and r["gamma_limit"] > 0.0]
+            rows = [
+                r
+                for r in found.searched_settings
+                if r["method"] == method and r["gamma_limit"] > 0.0
+            ]
             if not rows:
                 continue
             best = min(rows, key=lambda row: float(row["threshold_N"]))
@@ -192,12 +202,3 @@ def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
         axes.set_ylabel("smallest detected contact force [N]")
         axes.legend()
     return figure
-
-
-def _print_sentences(summary: dict[str, Any], out: Path) -> None:
-    from rich.console import Console
-
-    console = Console()
-    for line in summary["sentences"]:
-        console.print(line, highlight=False, markup=False)
-    console.print(f"written to {out}; run {out / 'tuned.yaml'}", highlight=False, markup=False)

@@ -34,7 +34,7 @@ _LINK_RADIUS_RATIO = 0.04  # radius of a bone over its length
 _CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
 
 
-def write_motion_film(path: Path, found: Excitation) -> None:
+def write_motion_replay(path: Path, found: Excitation) -> None:
     robot, trajectory = found.robot, found.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
@@ -44,7 +44,8 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
     force = np.linalg.norm(
-        non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.phi)[:, :3], axis=1
+        non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.heaviest_phi)[:, :3],
+        axis=1,
     )
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
     film = ReplayFile(
@@ -61,10 +62,10 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     )
 
     def make_scene(meshcat: Meshcat) -> ShowFrame:
-        _add_surroundings(
+        _add_table_and_sensor_path(
             meshcat, path_S, np.array([X_WB.translation() for X_WB in poses[0][0].values()])
         )
-        _AddLinks(meshcat, robot, context)
+        _AddLinkVisuals(meshcat, robot, context)
 
         def show(replay_time: float, frame: int) -> None:
             for body, X_WB in poses[frame][0].items():
@@ -87,18 +88,23 @@ def _link_poses(
     return poses, robot.sensor_frame.CalcPoseInWorld(context)
 
 
-def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
+def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))
         visuals = plant.GetVisualGeometriesForBody(body)
         shapes = visuals or plant.GetCollisionGeometriesForBody(body)
         add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _LINK_COLOUR)
-        for number, p_BJ in enumerate(() if visuals else _joint_positions(robot, context, body)):
-            _add_link_cylinder(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
+        for number, p_BJ in enumerate(
+            () if visuals else _outboard_joint_points(robot, context, body)
+        ):
+            name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
+            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
+            along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
+            meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
 
-def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
+def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
     plant = robot.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
@@ -110,14 +116,7 @@ def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterato
             yield p_BJ
 
 
-def _add_link_cylinder(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
-    length = float(np.linalg.norm(p_BJ))
-    meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
-    along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
-    meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
-
-
-def _add_surroundings(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
+def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
     set_plain_background(meshcat)
     visuals = np.vstack([path_S, bodies, np.zeros((1, 3))])
     low, high = visuals.min(axis=0), visuals.max(axis=0)
