@@ -15,7 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions_of
+from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.common.vectors import (
     add_cross_product,
     add_into,
@@ -107,7 +107,7 @@ class ArmModel:
         """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self.table, q, R_WS, p_WS)
-        return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
+        return np.concatenate([quaternions_from_matrices(R_WS[None])[0], p_WS])
 
     def with_load(self, phi: Array) -> ArmModel:
         table = self.table.copy()
