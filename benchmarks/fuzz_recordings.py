@@ -79,7 +79,7 @@ def _fields(path: Path, **defaults: Any) -> list[Any]:
 # Names through `new`.
 
 names = json_seeds(*({"arm": name, "frame": name[::-1], "package": "p"} for name in _NAMES))
-_PLAN: list[new_station.Plan] = []
+_PLAN: list[new_station.StationPlan] = []
 
 
 def name_mutation(rng: random.Random, content: bytes, _: bytes) -> bytes:
