@@ -77,7 +77,10 @@ def flag_unexplained_oscillation(
 def flag_unexplained_pose_oscillation(
     t: Array, command: Array, actual: Array, near: float
 ) -> Flags:
-    """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not."""
+    """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
+
+    `near` [s] is that of `flag_unexplained_oscillation`.
+    """
     turned, wanted = (quaternions_as_angles(pose, command) for pose in (actual, command))
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
     return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)

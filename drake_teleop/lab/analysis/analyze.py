@@ -181,7 +181,7 @@ def displacement_into_leaf(scenario: Scenario) -> list[float]:
         raise DrakeTeleopError(
             "is 0, so that the slave cannot press on the leaf spring",
             where="kinematic_scaling.translation_scale",
-            remedy="choose a scale above 0, or leave the sheet_spring out",
+            remedy="choose a scale above 0, or leave the leaf spring (sheet_spring) out",
         )
     tip = NominalSlave(scenario.slave).start_tip
     displacement = (

@@ -134,7 +134,10 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return the effects of each factor and half widths of joint intervals (Bonferroni)."""
+        """Return the effects of each factor and half widths of joint intervals (Bonferroni).
+
+        `table` (points, seeds) contains the measure.
+        """
         means = [self.comparable_levels(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)

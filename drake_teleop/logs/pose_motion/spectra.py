@@ -147,7 +147,7 @@ def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
 
 
 def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> ComplexArray:
-    """Return the spectrum (count, 6) of the tapered wrench, scaled as those of the signals."""
+    """Return the spectrum (count, 6) of the tapered wrench, scaled as by `signal_spectrum`."""
     fine = np.zeros(grid.transform_length * grid.stride)
     n = len(grid.wrench)
     full = np.interp(np.arange(n) / grid.stride, np.arange(len(taper)), taper)

@@ -132,7 +132,7 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
 
 
 def join_episodes(t: Array) -> tuple[Array, int]:
-    """Return increasing times (N,) for a clock that starts again, and the number of its starts.
+    """Return increasing times (N,) for a clock that starts again, and the number of episodes.
 
     A step back to near the first stamp is a new start. Other steps back are not changed.
     """

@@ -87,7 +87,9 @@ def read_log(
     expect_type((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
-            f"{bandwidth_hz:g} Hz is too low", where="bandwidth_hz", remedy="give more, or None"
+            f"{bandwidth_hz:g} Hz is too low",
+            where="bandwidth_hz",
+            remedy=f"give at least {_MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one",
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):

@@ -251,7 +251,8 @@ def initial_network_state(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
-    `neutral` (N,) contains the values at the receiver before the first packet.
+    `p` contains the network's parameters, `neutral` (N,) the values at the receiver before the
+    first packet.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])

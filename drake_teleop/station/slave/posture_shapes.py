@@ -137,7 +137,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[Overlap]:
-        """Return the pairs of overlapping bodies, except those that overlap by design."""
+        """Return the pairs of overlapping bodies, except those that nearly always overlap."""
         return [
             Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
             for (first, second), distance in self._distances_of_bodies().items()

@@ -37,8 +37,10 @@ def read_triangles(file: Path) -> Triangles:
 def check_triangles(triangles: Triangles) -> Triangles:
     """Return `triangles`; raise ValueError unless all their vertices exist and are finite."""
     vertices, faces = triangles
-    if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
+    if not faces.size:
         raise ValueError("a mesh has no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError("a mesh has triangles with missing vertices")
     if not np.isfinite(vertices).all():
         raise ValueError("a mesh has vertices that are not finite")
     return triangles
