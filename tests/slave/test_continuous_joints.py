@@ -255,9 +255,9 @@ def test_excitation_of_endless_joints_is_within_speed_limits(tmp_path, chain):
     assert np.isfinite(q).all()
     assert np.abs(q).max() < 3 * np.pi
     assert 0.1 < (np.abs(qd).max(axis=0) / robot.arm.velocity_limit).max() <= 1.0
-    uses = {use.limit: use for use in check_trajectory(robot, found.trajectory)}
+    uses = {use.limit_name: use for use in check_trajectory(robot, found.trajectory)}
     assert ("position" in uses) == np.isfinite(robot.arm.upper).any()
-    assert all(0.0 <= use.share <= 1.0 for use in uses.values())
+    assert all(0.0 <= use.used_share <= 1.0 for use in uses.values())
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
