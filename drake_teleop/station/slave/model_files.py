@@ -20,8 +20,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave.chain_joints import check_joints_form_tree
 from drake_teleop.station.slave.drake_errors import (
-    EXPECTED_ROBOT,
-    EXPECTED_SCENE,
+    ROBOT_ERROR_TEXTS,
+    SCENE_ERROR_TEXTS,
     raise_logged_errors,
     translate_drake_errors,
 )
@@ -73,9 +73,9 @@ def repair_and_parse_model(
     files.check_file(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
-    expected = EXPECTED_SCENE if purpose.is_scene else EXPECTED_ROBOT
+    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     with translate_drake_errors(path, expected, folder.name):
-        read = _add_directives if kind == ".yaml" else _add_file
+        read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
         instances, repaired = read(parser, path, files, purpose, folder)
         check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
@@ -95,7 +95,7 @@ def repair_and_parse_model(
     )
 
 
-def _add_file(
+def _add_repaired_file(
     parser: Parser,
     path: Path,
     files: ModelFiles,
@@ -112,7 +112,7 @@ def _add_file(
     return instances, [repaired]
 
 
-def _add_directives(
+def _add_files_of_directives(
     parser: Parser,
     path: Path,
     files: ModelFiles,
