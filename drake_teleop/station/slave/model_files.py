@@ -70,7 +70,7 @@ def repair_and_parse_model(
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     files.add_packages_to_map(parser.package_map())
-    files.check_file(path)
+    files.check_referenced_files(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
     expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
@@ -121,7 +121,7 @@ def _add_files_of_directives(
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
-    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)
+    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
         file = files.find_file(added.file)
         if file is None:
