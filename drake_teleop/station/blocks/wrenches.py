@@ -21,7 +21,7 @@ from drake_teleop.load.compensation import (
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
 
-_GRAVITY_W = (0.0, 0.0, -9.81)
+_GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
@@ -116,7 +116,7 @@ def WrenchScaling_(T: Any) -> Any:
             self,
             config: ForceScalingConfig | None = None,
             R_WB: ArrayLike | None = None,
-            gravity_W: ArrayLike = _GRAVITY_W,
+            gravity_W: ArrayLike = _GRAVITY_W_M_S2,
             converter: Any = None,
         ) -> None:
             LeafSystem_[T].__init__(self, converter)

@@ -20,7 +20,7 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
-    BODY_ROW_COLUMN,
+    BOX_BODY_ROW_COLUMN,
     NUM_PAIR_COLUMNS,
     contact_force,
     depth_of_sphere_in_box,
@@ -73,8 +73,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
-        if pair[BODY_ROW_COLUMN] >= 0.0:
-            body = bodies[int(pair[BODY_ROW_COLUMN])]
+        if pair[BOX_BODY_ROW_COLUMN] >= 0.0:
+            body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
             lever = minus(vector_at(normal, 3), vector_at(body, 4))
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
@@ -86,9 +86,9 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
     """Return a pair with its box at the present pose of the body, as `placed` (28,) if it moves."""
-    if pair[BODY_ROW_COLUMN] < 0.0:
+    if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
-    body = bodies[int(pair[BODY_ROW_COLUMN])]
+    body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
     copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
