@@ -150,7 +150,7 @@ def step_leader(
 
 
 @njit(cache=True)
-def _limit_wrench_to_motors(arm_without_hand, arm, joint_table, q, wrench, shortened):
+def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
@@ -313,6 +313,6 @@ class LeaderDisplay(ForceDisplay):
     def _wrench_to_display(self, context: Context) -> Array:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
+            _limit_wrench_to_motor_torques(*self._constants, q, wrench, self._shortened)
             return self._shortened
         return wrench

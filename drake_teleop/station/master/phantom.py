@@ -163,7 +163,7 @@ def gravity_torque_into(q, out):
 
 
 @njit(cache=True)
-def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
+def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
     # Main axes: Christoffel symbols of their closed-form M.
     coupling = _M23_MAX * math.cos(q[1] - q[2])
     yaw_2 = -2.0 * (_M11_COS2Q2 * math.sin(2.0 * q[1]) + _M23_MAX * math.sin(q[1]) * math.sin(q[2]))
@@ -233,7 +233,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
+    _subtract_coriolis_torque(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
     _add_friction_and_end_stops(q, v, device[DRY_FRICTION_SLOTS], device[DAMPING_SLOTS], vdot)
     solve_by_cholesky(M, vdot, 6)
 

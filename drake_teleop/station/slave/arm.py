@@ -268,7 +268,7 @@ def _write_joint_axis_and_link_wrench(table: Array, row: int, x: Array, link: Ar
 
 
 @njit(cache=True)
-def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
+def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
     """Sum the link wrenches from tip to base and project them to joint torques tau (n,) [N m]."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
@@ -302,7 +302,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         else:
             _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
         _write_joint_axis_and_link_wrench(table, row, x, link)
-    _project_on_joints(table, link, tau_out)
+    _project_wrenches_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR_COLUMN] * vdot[row] + table[row, DAMPING_COLUMN] * v[row]
 
@@ -412,7 +412,7 @@ def forward_dynamics(
         _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
-    _project_on_joints(table, link, vdot_out)
+    _project_wrenches_on_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING_COLUMN] * v[row]
         if table[row, DRY_FRICTION_COLUMN] != 0.0:

@@ -99,7 +99,7 @@ def ArmModelFromPlant(
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
-    lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
+    lower, upper = np.array([_joint_position_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -113,7 +113,7 @@ def ArmModelFromPlant(
     )
 
 
-def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+def _joint_position_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
@@ -213,7 +213,7 @@ def fill_missing_joint_limits(
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_limits`
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_position_limits`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"

@@ -70,7 +70,7 @@ _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT = 0.1
 
 
 @njit(cache=True)
-def _jacobian_and_error(table, L, pose, q, x, J, e):
+def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
     """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
@@ -91,7 +91,7 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 
 @njit(cache=True)
-def _gram_matrix_into(J, H):
+def _smaller_gram_matrix_into(J, H):
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -175,7 +175,7 @@ def _best_step_of_joint(J, e, i):
 
 
 @njit(cache=True)
-def _singularity_status(L, J):
+def _wrist_or_shoulder_status(L, J):
     n = J.shape[1]
     a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
     coplanar = abs(dot(a, cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
@@ -214,7 +214,7 @@ def follow_pose(
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
     if towards_posture:
         if upper[n - 1] - lower[n - 1] == np.inf:
-            _jacobian_and_error(table, L, pose, q, x, J, e)
+            _jacobian_and_pose_error(table, L, pose, q, x, J, e)
         for i in range(n):
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
@@ -225,8 +225,8 @@ def follow_pose(
             q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _jacobian_and_error(table, L, pose, q, x, J, e)
-    _gram_matrix_into(J, B)
+    squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+    _smaller_gram_matrix_into(J, B)
     damping = max(singular * singular - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
@@ -240,7 +240,7 @@ def follow_pose(
             ):
                 break
             if better:
-                _gram_matrix_into(J, H)
+                _smaller_gram_matrix_into(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i])
                     for k in range(6):
@@ -248,7 +248,7 @@ def follow_pose(
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
             if _damped_step(H, g, stiff, q, low, high, trial) < _POSE_ROUNDING_ERROR_M:
                 break
-            found = _jacobian_and_error(table, L, pose, trial, x, J, e)
+            found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
@@ -259,7 +259,7 @@ def follow_pose(
                 copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
-        _jacobian_and_error(table, L, pose, q, x, J, e)
+        _jacobian_and_pose_error(table, L, pose, q, x, J, e)
         p, rotation = vector_at(e, 0), vector_at(e, 3)
         if (
             dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
@@ -270,14 +270,14 @@ def follow_pose(
             # The pose has priority: repeat without the posture.
             towards_posture = False
             copy_into(q, 0, start, 0, n)
-            squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+            squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
-                return _singularity_status(L, J)
+                return _wrist_or_shoulder_status(L, J)
             copy_into(q, 0, kept, 0, n)
             far = before > _UNREACHED_ERROR_M * _UNREACHED_ERROR_M and expected_gain < 1e-3 * before
-            return _OUT_OF_REACH if far else _singularity_status(L, J)
+            return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
             push = 0.0
@@ -290,7 +290,7 @@ def follow_pose(
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
         if singular > 0.0 and free > _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared:
-            return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
+            return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
@@ -307,7 +307,7 @@ def follow_pose(
                 slope += g[i] * J[k, i] * e[k]
         for i in range(n):
             q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+        squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -333,12 +333,12 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
             return _nearest_joints_by_whole_turns(arm, q, reference), IkStatus(found)
-        squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
+        squared = _jacobian_and_pose_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
             if squared < _SEARCH_UNREACHED_M**2 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M:
-                status = _singularity_status(L, J)
+                status = _wrist_or_shoulder_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
     return _nearest_joints_by_whole_turns(arm, nearest, reference), IkStatus(status)

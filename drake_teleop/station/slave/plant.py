@@ -315,7 +315,7 @@ def _hull_corners_beyond_sensor_S(slave: Slave) -> list[Array]:
     return hulls
 
 
-def _farthest_point_along_z(hulls: list[Array]) -> Array:
+def _farthest_hull_point_along_z(hulls: list[Array]) -> Array:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
@@ -337,7 +337,7 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
     if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
-        return _farthest_point_along_z(hulls)
+        return _farthest_hull_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 

@@ -50,7 +50,7 @@ def remove_unusable_shapes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                fault = _shape_fault(shape) or _convert_mesh(shape, model, files, folder)
+                fault = _shape_fault(shape) or _convert_mesh_to_obj(shape, model, files, folder)
                 if fault:
                     link.remove(shape)
                     removed.add(fault)
@@ -89,7 +89,7 @@ def _numbers_in_text(text: str | None) -> list[float]:
     return [parse_number(word) for word in (text or "").split()]
 
 
-def _convert_mesh(
+def _convert_mesh_to_obj(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
     mesh = shape.find("geometry/mesh")
@@ -99,7 +99,7 @@ def _convert_mesh(
     file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
-    if fault := files.access_fault(file, "meshes"):
+    if fault := files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):

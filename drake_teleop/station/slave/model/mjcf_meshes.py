@@ -108,7 +108,7 @@ class MeshLibrary:
         file = self._mjcf.find_file(element, name, folder)
         if file is None:
             return None, _MESHES_NOT_FOUND_FAULT
-        if fault := self._mjcf.files.access_fault(file, f"{element.tag} files"):
+        if fault := self._mjcf.files.file_access_fault(file, f"{element.tag} files"):
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

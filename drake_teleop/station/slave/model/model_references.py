@@ -101,14 +101,14 @@ class ModelFiles:
             path = (folder or self._folder) / address.removeprefix("file://")
         return next(iter(_existing_forms_of_path(path)), None)
 
-    def may_read(self, path: Path) -> bool:
+    def may_read_file(self, path: Path) -> bool:
         """Return whether a file is in the model's folder or a package, after resolving links."""
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
-    def access_fault(self, path: Path, kind: str) -> str:
+    def file_access_fault(self, path: Path, kind: str) -> str:
         """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
-        if not self.may_read(path):
+        if not self.may_read_file(path):
             return (
                 f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
                 " (name their folder: --package-path, slave.package_paths)"
@@ -134,7 +134,7 @@ class ModelFiles:
 
     def _count_with_references(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
-        if not self.may_read(real):
+        if not self.may_read_file(real):
             raise DrakeTeleopError(
                 f"references {real}, which is outside the model's folder and its packages",
                 where=where,
