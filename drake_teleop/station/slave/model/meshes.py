@@ -50,7 +50,7 @@ def remove_unusable_shapes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                fault = _shape_fault(shape) or _convert_mesh_to_obj(shape, model, files, folder)
+                fault = _shape_fault(shape) or _resolve_mesh_file(shape, model, files, folder)
                 if fault:
                     link.remove(shape)
                     removed.add(fault)
@@ -89,7 +89,7 @@ def _numbers_in_text(text: str | None) -> list[float]:
     return [parse_number(word) for word in (text or "").split()]
 
 
-def _convert_mesh_to_obj(
+def _resolve_mesh_file(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
     mesh = shape.find("geometry/mesh")
