@@ -54,7 +54,7 @@ from drake_teleop.station.slave.inverse_kinematics import (
 )
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
-    MAX_STEPS_PER_COMMAND,
+    MAX_SOLVER_STEPS_PER_COMMAND,
     MIN_SINGULAR_VALUE_M,
     find_posture,
     follow_pose,
@@ -202,7 +202,7 @@ class Follower:
         q = np.empty(len(self.q))
         status: int = follow_pose(
             self.arm.table, self.L, pose, self.q, self.arm.lower, self.arm.upper, self.max_step,
-            self.posture, PERIOD, MIN_SINGULAR_VALUE_M, MAX_STEPS_PER_COMMAND, q,
+            self.posture, PERIOD, MIN_SINGULAR_VALUE_M, MAX_SOLVER_STEPS_PER_COMMAND, q,
         )  # fmt: skip
         self.q = q
         return status
@@ -348,7 +348,7 @@ class ClosedForm:
     def __call__(self, pose: Array) -> int:
         q = np.empty(6)
         status: int = solve_pose_command(
-            pose, self.q, self.arm.lower, self.arm.upper, InverseKinematics.MAX_JOINT_STEP_RAD, q
+            pose, self.q, self.arm.lower, self.arm.upper, InverseKinematics.MAX_JOINT_JUMP_RAD, q
         )
         self.q = q
         return status

@@ -42,7 +42,7 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
-from drake_teleop.station.master.data_sheets import Master, data_sheet_of_block
+from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
 from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
@@ -116,7 +116,7 @@ def draw(seed: int, index: int) -> Drawn:
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
     peak = (
-        Master(model=device, figures=data_sheet_of_block({"model": device}))
+        Master(model=device, figures=data_sheet_in_settings({"model": device}))
         .device(0.0, 0.0)
         .peak_force
     )
@@ -264,7 +264,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=data_sheet_of_block({"model": drawn.device})),
+        master=Master(model=drawn.device, figures=data_sheet_in_settings({"model": drawn.device})),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,

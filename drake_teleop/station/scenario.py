@@ -32,7 +32,7 @@ from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
-from drake_teleop.station.master.data_sheets import Master, data_sheet_of_block
+from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import check_distance
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -41,7 +41,7 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import JointControlConfig, position_interface_of_block
+from drake_teleop.station.slave.joint_control import JointControlConfig, position_interface_of_servo
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -252,9 +252,9 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
         wrist_sensor=preset_of_block(data.get("wrist_sensor")),
-        master=Master(figures=data_sheet_of_block(data.get("master"))),
+        master=Master(figures=data_sheet_in_settings(data.get("master"))),
         joint_control=JointControlConfig(
-            interface=position_interface_of_block(data.get("joint_control"))
+            interface=position_interface_of_servo(data.get("joint_control"))
         ),
     )
     scenario = settings_from_data(Scenario, data, where, defaults)

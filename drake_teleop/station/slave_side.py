@@ -33,7 +33,7 @@ from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointContro
 from drake_teleop.station.slave.joint_friction import FRICTION_TANH_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
-from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
+from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_ports, export_outputs
 
@@ -293,7 +293,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.drake_contact_reason or contact.plant_state_size or interface is not None:
         return 1
-    return samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
+    return servo_samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
 
 def _check_friction_time_step(slave: SlavePlant, step: float) -> None:

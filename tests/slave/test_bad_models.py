@@ -10,7 +10,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.home import check_motor_strength, find_start_posture, home_posture
+from drake_teleop.station.slave.home import check_holding_torque, find_start_posture, home_posture
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
@@ -88,7 +88,7 @@ def read(slave):
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
     model, assumed = parsed.arm()
-    check_motor_strength(model, find_start_posture(slave, model))
+    check_holding_torque(model, find_start_posture(slave, model))
     return [*parsed.assumptions, *assumed]
 
 

@@ -26,7 +26,7 @@ from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_limits
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, fill_missing_joint_limits
 from drake_teleop.station.slave.home import positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, InverseKinematics
 from drake_teleop.station.slave.joint_commands import JointRangeMonitor, LeaderJointFollower
@@ -76,7 +76,7 @@ def arm_of(text):
     (instance,) = Parser(plant).AddModelsFromString(text, "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("l0"))
     plant.Finalize()
-    return fill_missing_limits(ArmModelFromPlant(plant, instance, "ft"), "arm")
+    return fill_missing_joint_limits(ArmModelFromPlant(plant, instance, "ft"), "arm")
 
 
 ARMS = {chain: arm_of(urdf(chain))[0] for chain in POSTURES}

@@ -55,7 +55,7 @@ def test_lengths_are_those_of_the_model(plant):
         return plant.GetFrameByName(frame).CalcPoseInWorld(context).translation()[2]
 
     heights = [height(name) for name in ["base", "link_2", "link_3", "link_5", "sensor"]]
-    lengths = [ik.SHOULDER_HEIGHT_M, ik.UPPER_ARM_LENGTH_M, ik.FOREARM_LENGTH_M, ik.FLANGE_OFFSET_M]
+    lengths = [ik.SHOULDER_HEIGHT_M, ik.UPPER_ARM_LENGTH_M, ik.FOREARM_LENGTH_M, ik.WRIST_TO_S_M]
     np.testing.assert_allclose(np.diff(heights), lengths, atol=1e-15)
 
 
@@ -127,13 +127,13 @@ def test_full_rotation_nearest_to_reference_is_selected(arm, turn):
 def test_arm_stretches_towards_pose_out_of_reach(arm):
     direction = np.array([0.64, -0.6, -0.48])
     shoulder = np.array([0, 0, ik.SHOULDER_HEIGHT_M])
-    p = shoulder + 1.3 * direction + ik.FLANGE_OFFSET_M * R_DOWN[:, 2]
+    p = shoulder + 1.3 * direction + ik.WRIST_TO_S_M * R_DOWN[:, 2]
     q, status = nearest_branch(R_DOWN, p, Q_HOME, arm.lower, arm.upper)
     assert status == IkStatus.OUT_OF_REACH
     R, p_found = forward(arm, q)
     np.testing.assert_allclose(R, R_DOWN, atol=1e-12)
     reach = ik.UPPER_ARM_LENGTH_M + ik.FOREARM_LENGTH_M
-    wrist = p_found - ik.FLANGE_OFFSET_M * R[:, 2]
+    wrist = p_found - ik.WRIST_TO_S_M * R[:, 2]
     np.testing.assert_allclose(wrist, shoulder + reach * direction, atol=1e-12)
 
 

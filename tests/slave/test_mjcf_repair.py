@@ -17,7 +17,7 @@ from test_model_repairs import pose, read, written
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.mjcf_masses import fit_primitive
+from drake_teleop.station.slave.model.mjcf_masses import fit_shape_to_mesh
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
@@ -238,7 +238,7 @@ def test_primitive_that_replaces_a_mesh(kind, by_box, expected, sides):
     X = RigidTransform(degrees(10, 20, 30), [0.4, -0.5, 0.6])
     triangles = Triangles(X.multiply((CORNERS * sides).T).T, FACES)
     mesh = SimpleNamespace(triangles=lambda: triangles, inertia="exact")
-    X_found, size = fit_primitive(mesh, kind, by_box=by_box)
+    X_found, size = fit_shape_to_mesh(mesh, kind, by_box=by_box)
     np.testing.assert_allclose(size, expected, atol=1e-12)
     np.testing.assert_allclose(X_found.translation(), X.translation(), atol=1e-12)
     longest = X.rotation().matrix()[:, sides.index(3)]

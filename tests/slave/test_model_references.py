@@ -118,7 +118,7 @@ def test_a_binary_gltf_reads_no_file_outside(folder: Path) -> None:
     head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
     (folder / "x.glb").write_bytes(head + text)
     with pytest.raises(DrakeTeleopError, match=OUTSIDE):
-        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check_file(folder / "x.glb")
+        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check_referenced_files(folder / "x.glb")
 
 
 @pytest.mark.parametrize(
@@ -332,9 +332,9 @@ def test_file_in_working_folder_is_outside_model(
 
 def test_too_large_files_are_rejected(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
-    monkeypatch.setattr(model_references, "_MAX_TEXT_BYTES", 400)
+    monkeypatch.setattr(model_references, "_MAX_TEXT_FILE_BYTES", 400)
     assert any("exceeds the limit" in words for words in parse(path).assumptions)
-    monkeypatch.setattr(model_references, "_MAX_TEXT_BYTES", 100)
+    monkeypatch.setattr(model_references, "_MAX_TEXT_FILE_BYTES", 100)
     with pytest.raises(DrakeTeleopError, match=r"a\.urdf: exceeds the limit of"):
         parse(path)
 

@@ -23,9 +23,9 @@ from drake_teleop.station.slave.model.link_repair import (
     nearest_possible_inertia,
     repair_inertia,
 )
-from drake_teleop.station.slave.model.model_numbers import check_quantities
+from drake_teleop.station.slave.model.model_numbers import check_lengths_and_inertias
 from drake_teleop.station.slave.model.repair_report import RepairReport
-from drake_teleop.station.slave.model.urdf_repair import _has_colour, find_dependent_parts
+from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
 from drake_teleop.station.slave.models import ParseModel, ParseScene
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
@@ -436,7 +436,7 @@ def test_coupled_joints_and_floating_links_are_dependent(inside, expected, paren
         f'<joint name="f" type="floating">{ends}</joint></r>'
     )
     floating = {} if parent == "world" else {"c": "floats on l2"}
-    assert find_dependent_parts(root) == expected | floating
+    assert find_dependence_reasons(root) == expected | floating
 
 
 @pytest.mark.parametrize(
@@ -450,7 +450,7 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
     for k, text in enumerate(texts):
         report = RepairReport()
         link = ElementTree.fromstring(f'<link name="l">{text}{"</inertial>" * (k > 1)}</link>')
-        check_quantities(link, "link l", report)
+        check_lengths_and_inertias(link, "link l", report)
         repair_inertia(link, report, is_sdf=False, at_rest=False)
         if allowed and not (k == 2 and value[0] == "-"):
             report.raise_faults(tmp_path)
@@ -472,7 +472,7 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
 )
 def test_colours_have_four_numbers_from_0_to_1(rgba, kept):
     material = ElementTree.fromstring(f'<material><texture/><color rgba="{rgba}"/></material>')
-    assert _has_colour(material) == kept
+    assert _has_valid_colour(material) == kept
     assert material.find("texture") is None
 
 

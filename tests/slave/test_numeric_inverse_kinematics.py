@@ -22,7 +22,7 @@ from drake_teleop.station.slave.inverse_kinematics import (
 )
 from drake_teleop.station.slave.joint_commands import IK_METHODS
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
-    MAX_STEPS_PER_COMMAND,
+    MAX_SOLVER_STEPS_PER_COMMAND,
     MIN_SINGULAR_VALUE_M,
     POSE_TOLERANCE_M,
     NumericInverseKinematics,
@@ -100,7 +100,7 @@ def follow(case, pose, reference, *, max_step=np.inf, posture=None, pull=0.0):
     reference = np.array(reference, dtype=float)
     status = follow_pose(
         arm.table, orientation_length(arm), pose, reference, arm.lower, arm.upper, far, posture,
-        pull, MIN_SINGULAR_VALUE_M, MAX_STEPS_PER_COMMAND, q,
+        pull, MIN_SINGULAR_VALUE_M, MAX_SOLVER_STEPS_PER_COMMAND, q,
     )  # fmt: skip
     return q, IkStatus(status)
 

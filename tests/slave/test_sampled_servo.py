@@ -19,7 +19,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
 from drake_teleop.station.slave.sampled_servo import (
     SampledServo,
     predict_torque_line,
-    samples_per_event,
+    servo_samples_per_event,
 )
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
@@ -145,4 +145,4 @@ def test_line_stays_within_torque_limits_and_survives_invalid_command():
     [(2e3, 2e3, 1), (1e4, 2e3, 5), (1e4, 1e3, 5), (4e3, 500.0, 2), (2e3, 1e3, 1), (1e4, 3e3, 1)],
 )
 def test_events_at_2_khz_or_more_include_each_hand_sample(control, hand, samples):
-    assert samples_per_event(control, hand) == samples
+    assert servo_samples_per_event(control, hand) == samples

@@ -37,7 +37,7 @@ from drake_teleop.common.vectors import (
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
-from drake_teleop.station.environment.point_contact import FRICTION_COLUMNS
+from drake_teleop.station.environment.point_contact import PAIR_FRICTION_COLUMNS
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
@@ -613,7 +613,7 @@ def _remove_friction(diagram: Diagram) -> None:
         properties = inspector.GetProximityProperties(geometry)
         properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
         scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION_COLUMNS] = 0.0
+    GetBlock(diagram, "wrist_sensor").contact_pairs[:, PAIR_FRICTION_COLUMNS] = 0.0
 
 
 def _check_rates(scenario: Scenario) -> None:

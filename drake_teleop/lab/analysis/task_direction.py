@@ -17,7 +17,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.station.environment.point_contact import STIFFNESS_COLUMN
+from drake_teleop.station.environment.point_contact import PAIR_STIFFNESS_COLUMN
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
@@ -124,7 +124,7 @@ def _wall_stiffness(scenario: Scenario) -> float:
     if not isinstance(wall, Wall):
         return 0.0
     pairs = AddSlavePlant(DiagramBuilder(), scenario.slave, wall).contact.compiled_pairs
-    return float(pairs[:, STIFFNESS_COLUMN].sum())
+    return float(pairs[:, PAIR_STIFFNESS_COLUMN].sum())
 
 
 def _device_mass_and_damping(

@@ -27,7 +27,7 @@ from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
-    fill_missing_limits,
+    fill_missing_joint_limits,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
@@ -93,7 +93,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     scene = CollisionScene(
         parse, (_HEAVIEST_LOAD_RATIO - 1) * slave.arm.phi_load, visuals_count=not own
     )
-    scene.arm, _ = fill_missing_limits(scene.arm, str(scenario.slave.path))
+    scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
     return _make_robot(
         scene,
@@ -165,7 +165,7 @@ def RobotFromModel(
     with translate_drake_errors(path):
         scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
-    scene.arm, completed = fill_missing_limits(
+    scene.arm, completed = fill_missing_joint_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
     )
     return _make_robot(

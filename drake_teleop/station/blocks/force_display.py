@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import (
-    DISPLAYED_SLOTS,
+    DISPLAYED_WRENCH_SLOTS,
     initial_display_state,
     step_display,
 )
@@ -65,7 +65,7 @@ class ForceDisplay(SteppedBlock):
         output.SetFromVector(self._step_results(context)[0][:6])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[0][DISPLAYED_SLOTS])
+        output.SetFromVector(self._step_results(context)[0][DISPLAYED_WRENCH_SLOTS])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_results(context)[0][DISPLAYED_SLOTS.stop]
+        output[0] = self._step_results(context)[0][DISPLAYED_WRENCH_SLOTS.stop]

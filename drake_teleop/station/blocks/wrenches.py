@@ -21,15 +21,15 @@ from drake_teleop.load.compensation import (
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
 
-_GRAVITY_W = (0.0, 0.0, -9.81)
+_GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
-def _function_for_scalar_type(function: Any, T: Any) -> Callable[..., None]:
+def _compiled_or_python_function(function: Any, T: Any) -> Callable[..., None]:
     return function if T is float else function.py_func
 
 
-def _basic_vector_of_type(T: Any, size: int) -> Any:
+def _zero_vector_of_type(T: Any, size: int) -> Any:
     return np.zeros(size) if T is float else np.full(size, T(0.0), dtype=object)
 
 
@@ -73,9 +73,9 @@ def NonContactWrench_(T: Any) -> Any:
                 phi = self._load.Eval(context)
             else:
                 phi = context.get_numeric_parameter(self._parameter).CopyToVector()
-            wrench = _basic_vector_of_type(T, 6)
+            wrench = _zero_vector_of_type(T, 6)
             motion = [port.Eval(context) for port in self._motion]
-            _function_for_scalar_type(non_contact_wrench_into, T)(*motion, phi, wrench)
+            _compiled_or_python_function(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
     return Impl
@@ -116,7 +116,7 @@ def WrenchScaling_(T: Any) -> Any:
             self,
             config: ForceScalingConfig | None = None,
             R_WB: ArrayLike | None = None,
-            gravity_W: ArrayLike = _GRAVITY_W,
+            gravity_W: ArrayLike = _GRAVITY_W_M_S2,
             converter: Any = None,
         ) -> None:
             LeafSystem_[T].__init__(self, converter)
@@ -140,8 +140,8 @@ def WrenchScaling_(T: Any) -> Any:
 
         def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
-            wrench = _basic_vector_of_type(T, 6)
-            _function_for_scalar_type(scaled_wrench_into, T)(
+            wrench = _zero_vector_of_type(T, 6)
+            _compiled_or_python_function(scaled_wrench_into, T)(
                 measured, estimate[:6], s, omega, alpha, *self._parts(estimate), *scales, wrench
             )
             return wrench
@@ -169,7 +169,7 @@ def WrenchScaling_(T: Any) -> Any:
                     raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 parts = self._parts(self._inputs[-1].Eval(context))
-                _function_for_scalar_type(add_weight_into, T)(gravity, *parts, *excess, wrench)
+                _compiled_or_python_function(add_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
@@ -179,9 +179,9 @@ def WrenchScaling_(T: Any) -> Any:
                     where="WrenchScaling.wrench_to_master",
                     remedy="connect a rotation matrix, by rows",
                 )
-            wrench, k = _basic_vector_of_type(T, 6), self._config.force_scale
+            wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
-            _function_for_scalar_type(wrench_to_master_into, T)(
+            _compiled_or_python_function(wrench_to_master_into, T)(
                 scaled, R_WS, self._R_WB, k, k, wrench
             )
             output.SetFromVector(wrench)

@@ -122,7 +122,7 @@ def AddFreeJoint(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform
     joint.set_default_positions(np.concatenate([turn, X_WBody.translation()]))
 
 
-def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
+def BodiesWeldedToTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
     return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
 
 
@@ -137,7 +137,7 @@ def ToolShapes(
             for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index))
             if properties(shape) is not None
         ]
-        for index in BodiesOfTool(plant, tool)
+        for index in BodiesWeldedToTool(plant, tool)
     }
 
 

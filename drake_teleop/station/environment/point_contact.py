@@ -33,7 +33,7 @@ from drake_teleop.common.vectors import (
 )
 
 #: Columns of `ShapePairs.compiled_pairs`: stiffness; both frictions; row of the box's body.
-STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_ROW_COLUMN = 22, slice(24, 26), 27
+PAIR_STIFFNESS_COLUMN, PAIR_FRICTION_COLUMNS, BOX_BODY_ROW_COLUMN = 22, slice(24, 26), 27
 #: Number of columns of `ShapePairs.compiled_pairs` and `ShapePairs.monitored_pairs`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"

@@ -13,13 +13,13 @@ from pydrake.multibody.tree import BodyIndex, PrismaticSpring
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import (
-    BodiesOfTool,
+    BodiesWeldedToTool,
     Environment,
     ExcludeContact,
     FloorStand,
 )
 
-_BENCH_HEIGHT_M = 0.15  # from the lower face of the model's bench to the leaf [m]
+_BENCH_BASE_TO_LEAF_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -69,7 +69,7 @@ class SheetSpring(Environment):
     @property
     def floor_stand(self) -> FloorStand:
         x, y, z = self.position
-        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT_M)
+        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BASE_TO_LEAF_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""
@@ -92,7 +92,7 @@ class SheetSpring(Environment):
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
         leaf = plant.GetBodyByName("leaf")
-        tool_bodies = BodiesOfTool(plant, tool)
+        tool_bodies = BodiesWeldedToTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
         shapes = plant.GetCollisionGeometriesForBody(leaf)
         ExcludeContact(plant, scene_graph, shapes, others)

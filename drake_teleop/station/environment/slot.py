@@ -26,10 +26,10 @@ from drake_teleop.station.environment.environment import ContactMaterial, Enviro
 #: (E) is as high as the nut above it permits in the deepest slot.
 PEG_RADIUS_M, TIP_BALL_CENTRE_Z_S_M, UPPER_BALL_CENTRE_Z_S_M = 0.012, 0.188, 0.158
 #: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
-SLOT_LENGTH_M, _SIDE_WIDTH_M = 0.10, 0.04
-_FLOOR_THICKNESS_M = 0.02
+SLOT_LENGTH_M, _SIDE_BLOCK_WIDTH_M = 0.10, 0.04
+_SLOT_FLOOR_THICKNESS_M = 0.02
 _SLOT_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
-_BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
+_PEG_BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
 
 @settings
@@ -70,7 +70,7 @@ class Slot(Environment):
     @property
     def floor_bottom_height(self) -> float:
         """Height z_W of the floor's lower face [m]."""
-        return self.position[2] - self.depth - _FLOOR_THICKNESS_M
+        return self.position[2] - self.depth - _SLOT_FLOOR_THICKNESS_M
 
     @property
     def X_WM(self) -> RigidTransform:
@@ -90,7 +90,7 @@ class Slot(Environment):
         above = RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z_S_M])
         ball, properties = Sphere(PEG_RADIUS_M), _contact_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
-        plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
+        plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _PEG_BALL_COLOUR)
         for name, (X_MBox, box) in _boxes_of_slot(self).items():
             plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
             plant.RegisterVisualGeometry(body, X_MBox, box, name, _SLOT_COLOUR)
@@ -114,7 +114,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
             """Return a box on one side of the slot, from y `inner` outwards and z `top` down."""
-            across, height = edge + c + _SIDE_WIDTH_M - inner, depth + top
+            across, height = edge + c + _SIDE_BLOCK_WIDTH_M - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH_M, across, height)
 
@@ -125,7 +125,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
         boxes[f"{name}_wall"] = block(edge, -c)
         boxes[f"{name}_top"] = block(edge + c, 0.0)
         boxes[f"{name}_chamfer"] = into, Box(SLOT_LENGTH_M, c * np.sqrt(2), thick)
-    across = slot.width + 2 * (c + _SIDE_WIDTH_M)
-    below = RigidTransform([0.0, 0.0, -depth - _FLOOR_THICKNESS_M / 2])
-    boxes["floor"] = below, Box(SLOT_LENGTH_M, across, _FLOOR_THICKNESS_M)
+    across = slot.width + 2 * (c + _SIDE_BLOCK_WIDTH_M)
+    below = RigidTransform([0.0, 0.0, -depth - _SLOT_FLOOR_THICKNESS_M / 2])
+    boxes["floor"] = below, Box(SLOT_LENGTH_M, across, _SLOT_FLOOR_THICKNESS_M)
     return boxes

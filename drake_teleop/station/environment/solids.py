@@ -14,7 +14,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import (
     AddFreeJoint,
-    BodiesOfTool,
+    BodiesWeldedToTool,
     ContactMaterial,
     Environment,
     ExcludeContact,
@@ -25,7 +25,7 @@ from drake_teleop.station.environment.environment import (
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
 _WALL_THICKNESS_M = 0.1  # m; deep enough that a tool leaves through the face
 _FOOT_RADIUS_M, _TABLE_THICKNESS_M = 0.002, 0.05  # m: radius of the balls, thickness of the table
-_BLOCK_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
+_BLOCK_BODY_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 
 
@@ -164,7 +164,7 @@ class Block(Surface):
                 plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS_M], self
             )
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
-        body = plant.AddRigidBody(_BLOCK_NAME, NewInstance(plant, _BLOCK_NAME), inertia)
+        body = plant.AddRigidBody(_BLOCK_BODY_NAME, NewInstance(plant, _BLOCK_BODY_NAME), inertia)
         x, y, foot = self.position
         turned = RollPitchYaw(0.0, 0.0, self.yaw)
         X_WBlock = RigidTransform(turned, [x, y, foot + self.size[2] / 2])
@@ -172,8 +172,8 @@ class Block(Surface):
         if not plant.geometry_source_is_registered():
             return
         here, box = RigidTransform(), BoxShape(*self.size)
-        plant.RegisterCollisionGeometry(body, here, box, _BLOCK_NAME, self.material())
-        plant.RegisterVisualGeometry(body, here, box, _BLOCK_NAME, _BLOCK_COLOUR)
+        plant.RegisterCollisionGeometry(body, here, box, _BLOCK_BODY_NAME, self.material())
+        plant.RegisterVisualGeometry(body, here, box, _BLOCK_BODY_NAME, _BLOCK_COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
             place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS_M))
             ball = Sphere(_FOOT_RADIUS_M)
@@ -186,12 +186,12 @@ class Block(Surface):
     ) -> None:
         """Let the tool touch only the block's box, and other bodies only its balls at corners."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
-        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_NAME]
+        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_BODY_NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]
         name = scene_graph.model_inspector().GetName
         feet = [shape for shape in shapes if _FOOT_NAME_PREFIX in name(shape)]
         boxes = [shape for shape in shapes if shape not in feet]
-        tool_bodies = BodiesOfTool(plant, tool)
+        tool_bodies = BodiesWeldedToTool(plant, tool)
         ExcludeContact(plant, scene_graph, feet, tool_bodies)
         others = {*tool_bodies, *(body.index() for body in blocks)}
         ExcludeContact(plant, scene_graph, boxes, [k for k in bodies if k not in others])

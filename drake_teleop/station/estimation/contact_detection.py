@@ -50,7 +50,7 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _update_flag_with_arm(memory, sample, estimate, arm, settings):
+def _contact_flag_with_arm(memory, sample, estimate, arm, settings):
     acceleration = np.empty(3)
     sensor_acceleration_into(
         arm,
@@ -123,7 +123,7 @@ class ContactDetection(LeafSystem):
         return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
 
     def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
-        return bool(_update_flag_with_arm(memory, sample, estimate, self._arm, self._settings))
+        return bool(_contact_flag_with_arm(memory, sample, estimate, self._arm, self._settings))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)

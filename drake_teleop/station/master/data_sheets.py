@@ -15,7 +15,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.device_parameters import (
-    COULOMB_SLOTS,
+    DAMPING_SLOTS,
+    DRY_FRICTION_SLOTS,
     HALF_WORKSPACE_SLOTS,
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
@@ -26,7 +27,6 @@ from drake_teleop.station.master.device_parameters import (
     NUM_DEVICE_PARAMETERS,
     PEAK_FORCE_SLOT,
     PEAK_TORQUE_SLOTS,
-    VISCOUS_SLOTS,
     WORKSPACE_CENTRE_SLOTS,
 )
 from drake_teleop.station.master.dynamics import HapticDevice
@@ -94,8 +94,8 @@ class DeviceFigures:
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
 _OMEGA_SIZE_M = [0.11, 0.113, 0.113]
-_OMEGA_ANGLES_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
-_ENCODER_STEP_RAD = math.radians(0.09)
+_OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
+_OMEGA_STEP_RAD = math.radians(0.09)
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -106,14 +106,14 @@ _ENCODER_STEP_RAD = math.radians(0.09)
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_TURN_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_TURN_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_MAX_TURN_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_MAX_TURN_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_DATA_SHEET_FIELDS = (
+_DATA_SHEET_FIELD_NAMES = (
     *("apparent_mass", "friction", "peak_force", "size"),
     *("turn", "resolution", "turn_resolution", "rate_hz"),
 )
@@ -121,7 +121,7 @@ _DATA_SHEET_FIELDS = (
 FIGURES = Registry(
     "device",
     {
-        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELDS, copy.deepcopy(row), strict=True)))
+        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELD_NAMES, copy.deepcopy(row), strict=True)))
         for name, row in _DATA_SHEETS.items()
     },
 )
@@ -155,15 +155,15 @@ class Master:
         parameters = np.zeros(NUM_DEVICE_PARAMETERS)
         parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            parameters[COULOMB_SLOTS] = self.friction.coulomb
-            parameters[VISCOUS_SLOTS] = self.friction.viscous
+            parameters[DRY_FRICTION_SLOTS] = self.friction.coulomb
+            parameters[DAMPING_SLOTS] = self.friction.viscous
             parameters[PEAK_FORCE_SLOT] = PEAK_FORCE_N
             parameters[PEAK_TORQUE_SLOTS] = PEAK_WRIST_TORQUES_N_M
             return HapticDevice(parameters, self.model)
         figures = self._data_sheet()
         parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
-        parameters[COULOMB_SLOTS] = np.repeat([figures.friction, figures.friction_torque], 3)
-        parameters[VISCOUS_SLOTS] = np.repeat([figures.damping, figures.turning_damping], 3)
+        parameters[DRY_FRICTION_SLOTS] = np.repeat([figures.friction, figures.friction_torque], 3)
+        parameters[DAMPING_SLOTS] = np.repeat([figures.damping, figures.turning_damping], 3)
         parameters[PEAK_FORCE_SLOT] = figures.peak_force
         parameters[PEAK_TORQUE_SLOTS] = figures.peak_torque
         parameters[MASS_SLOT], parameters[INERTIA_SLOT] = figures.apparent_mass, figures.inertia
@@ -249,17 +249,17 @@ class Master:
                     where=f"{where}.figures",
                     remedy="leave them out",
                 )
-        if self.figures is not None and self.figures.turn[1] > _MAX_PITCH_RAD:
+        if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
             raise DrakeTeleopError(
                 f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
                 "where the axes of yaw and roll are parallel",
                 where=f"{where}.figures.turn",
-                remedy=f"choose at most {_MAX_PITCH_RAD:g} rad",
+                remedy=f"choose at most {_MAX_DEVICE_PITCH_RAD:g} rad",
             )
 
 
-_MAX_PITCH_RAD = 1.5  # rad
+_MAX_DEVICE_PITCH_RAD = 1.5  # rad
 
 
-def data_sheet_of_block(block: Mapping[str, Any] | None) -> DeviceFigures | None:
+def data_sheet_in_settings(block: Mapping[str, Any] | None) -> DeviceFigures | None:
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -14,9 +14,9 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_d
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
-_MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
+_MAX_DEVICE_PERIOD_S = 1e-3  # s, slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
-_MAX_RATE_TIMES_PERIOD = 2.0
+_MAX_STABLE_RATE_TIMES_PERIOD = 2.0
 
 
 @njit(cache=True, borrows=True)
@@ -29,23 +29,23 @@ def _advance_device(device, work, stages, state, pose, twist, display, hand_wren
     copy_into(display, 0, state, 0, 6)
 
 
-def check_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
+def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
-    if not 0 < period <= _MAX_PERIOD_S:
+    if not 0 < period <= _MAX_DEVICE_PERIOD_S:
         raise DrakeTeleopError(
             f"the haptic device's period of {period:g} s is not above 0 and at most "
-            f"{_MAX_PERIOD_S:g} s",
+            f"{_MAX_DEVICE_PERIOD_S:g} s",
             where="master.period",
             remedy="choose a hand rate of 1 kHz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _MAX_RATE_TIMES_PERIOD:
+    if rate * period > _MAX_STABLE_RATE_TIMES_PERIOD:
         raise DrakeTeleopError(
             f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
             f"simulation with a period of {1e3 * period:g} ms is unstable",
-            where=device.friction_field,
+            where=device.friction_setting_path,
             remedy="choose less friction, or a higher hand rate",
         )
 
@@ -71,7 +71,7 @@ class MasterDevice(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: HapticDevice, q_initial: Array) -> None:
-        check_period(device, q_initial, period)
+        check_device_period(device, q_initial, period)
         constants = device.parameters, np.zeros((2, 6, 6)), np.zeros((3, 12))
         super().__init__(period, device, q_initial, _advance_device, constants)
 
@@ -82,7 +82,7 @@ def AddHapticDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: Array,
 ) -> tuple[LeafSystem, LeafSystem]:
-    check_period(device, q_initial, period)
+    check_device_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):
         block: LeafSystem = LeaderArm(period, device, q_initial)
         display: LeafSystem = LeaderDisplay(period, device)

@@ -9,8 +9,8 @@ NUM_DEVICE_PARAMETERS = 31  #: length of the vector
 _layout = SlotAllocator(NUM_DEVICE_PARAMETERS)
 HAND_MASS_SLOT = _layout.number()  #: mass of the hand on the grip [kg]
 HAND_INERTIA_SLOT = _layout.number()  #: inertia of the hand about every axis through E [kg m^2]
-COULOMB_SLOTS = _layout.vector(6)  #: Coulomb friction of the device's axes [N or N m]
-VISCOUS_SLOTS = _layout.vector(6)  #: damping of these axes [N s/m or N m s/rad]
+DRY_FRICTION_SLOTS = _layout.vector(6)  #: Coulomb friction of the device's axes [N or N m]
+DAMPING_SLOTS = _layout.vector(6)  #: damping of these axes [N s/m or N m s/rad]
 PEAK_FORCE_SLOT = _layout.number()  #: largest displayed force [N]
 PEAK_TORQUE_SLOTS = _layout.vector(
     3

@@ -12,13 +12,13 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
 from drake_teleop.station.master.device_parameters import (
-    COULOMB_SLOTS,
+    DAMPING_SLOTS,
+    DRY_FRICTION_SLOTS,
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
     IS_IN_TASK_SPACE_SLOT,
     PEAK_FORCE_SLOT,
     PEAK_TORQUE_SLOTS,
-    VISCOUS_SLOTS,
 )
 
 
@@ -117,7 +117,7 @@ class HapticDevice(HapticDeviceBase):
     num_joints = 6
 
     @property
-    def friction_field(self) -> str:
+    def friction_setting_path(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
     def coordinates_for_display(self, q: Array) -> Array:
@@ -171,6 +171,6 @@ class HapticDevice(HapticDeviceBase):
         With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
-            slope = creeping * self.parameters[COULOMB_SLOTS] / phantom.FRICTION_SPEED_RAD_S
-            return np.diag(slope + self.parameters[VISCOUS_SLOTS])
+            slope = creeping * self.parameters[DRY_FRICTION_SLOTS] / phantom.FRICTION_TANH_RAD_S
+            return np.diag(slope + self.parameters[DAMPING_SLOTS])
         return task_space.damping_matrix(q, self.parameters, creeping)

@@ -33,11 +33,11 @@ from drake_teleop.station.passivity.safe_state import (
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
 _layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
-_POSITIONS_SLOTS, _LAST_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
-DISPLAYED_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
+_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
+DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
 _IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
 _MONITOR_SLOTS = _layout.vector(MASTER_MONITOR_SIZE)
-_DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_SLOTS.start, _FAULT_SLOT + 1)
+_DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
@@ -50,7 +50,7 @@ def _peak_wrench_of_device(parameters):
 
 def initial_display_state(q: Array, parameters: Array) -> Array:
     display = np.zeros(_MONITOR_SLOTS.stop)
-    display[_POSITIONS_SLOTS] = display[_LAST_POSITIONS_SLOTS] = q
+    display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
     display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
     return display
 
@@ -91,15 +91,15 @@ def step_display(wrench, device, parameters, period, J, drive):
 
     `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
-    q, fault = device[_POSITIONS_SLOTS], _NO_FAULT
+    q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
     copy_into(drive, 6, device, 6, _MONITOR_SLOTS.stop - 6)
     if all_in_range(q):
-        copy_into(drive, _LAST_POSITIONS_SLOTS.start, q, 0, 6)
+        copy_into(drive, _LAST_VALID_POSITIONS_SLOTS.start, q, 0, 6)
     else:
-        q, fault = device[_LAST_POSITIONS_SLOTS], _HAND_FAULT
+        q, fault = device[_LAST_VALID_POSITIONS_SLOTS], _HAND_FAULT
     if not all_in_range(wrench):
         fault = _WRENCH_FAULT
-    displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_SLOTS], fault
+    displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_WRENCH_SLOTS], fault
     jacobian_into(q, parameters, J)
     limit_wrench_into(wrench, parameters, J, displayed)
     if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED_SLOT] != 0.0:
@@ -109,7 +109,7 @@ def step_display(wrench, device, parameters, period, J, drive):
 
 @njit(cache=True)
 def _fade_wrench_after_fault(device, parameters, period, drive):
-    displayed, last = drive[DISPLAYED_SLOTS], device[DISPLAYED_SLOTS]
+    displayed, last = drive[DISPLAYED_WRENCH_SLOTS], device[DISPLAYED_WRENCH_SLOTS]
     limits, full = np.empty(2), _peak_wrench_of_device(parameters)
     fault = drive[_FAULT_SLOT] != _NO_FAULT
     drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
@@ -228,7 +228,7 @@ class ForceDisplay(LeafSystem):
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[DISPLAYED_SLOTS])
+        output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT_SLOT]

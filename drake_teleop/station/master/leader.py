@@ -37,18 +37,18 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 # Rows of `LeaderDevice.joint_table`.
 (
     _COULOMB_ROW,
-    _VISCOUS_ROW,
-    _LOWER_ROW,
-    _UPPER_ROW,
+    _DAMPING_ROW,
+    _MIN_Q_ROW,
+    _MAX_Q_ROW,
     _STOP_STIFFNESS_ROW,
     _STOP_DAMPING_ROW,
     _TORQUE_LIMIT_ROW,
-    _WEIGHT_SHARE_ROW,
+    _CARRIED_WEIGHT_SHARE_ROW,
 ) = range(8)
 # Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED): a slower joint creeps.
 FRICTION_TANH_SPEED = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
-_END_STOP_FREQUENCY_HZ = 12.0
+_END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
@@ -66,8 +66,8 @@ def leader_acceleration(arm, joint_table, q, v, applied, motor, vdot):
         wrench[3 + i] += moment[i]
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(v[i] / FRICTION_TANH_SPEED)
-        tau[i] -= joint_table[_VISCOUS_ROW, i] * v[i]
-        lower, upper, stiffness, damping = joint_table[_LOWER_ROW : _STOP_DAMPING_ROW + 1, i]
+        tau[i] -= joint_table[_DAMPING_ROW, i] * v[i]
+        lower, upper, stiffness, damping = joint_table[_MIN_Q_ROW : _STOP_DAMPING_ROW + 1, i]
         tau[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
     forward_dynamics(arm, q, v, tau, wrench, vdot)
 
@@ -102,7 +102,7 @@ def motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
     inverse_dynamics(arm_without_hand, q, still, still, torque)
     jacobian(arm, q, J)
     for i in range(n):
-        torque[i] *= joint_table[_WEIGHT_SHARE_ROW, i]
+        torque[i] *= joint_table[_CARRIED_WEIGHT_SHARE_ROW, i]
         for k in range(6):
             torque[i] += J[k, i] * F[k]
         limit = joint_table[_TORQUE_LIMIT_ROW, i]
@@ -150,7 +150,7 @@ def step_leader(
 
 
 @njit(cache=True)
-def _limit_wrench_to_motors(arm_without_hand, arm, joint_table, q, wrench, shortened):
+def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
@@ -188,7 +188,7 @@ class LeaderDevice(HapticDeviceBase):
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
-    friction_field = "master.leader"
+    friction_setting_path = "master.leader"
 
     @property
     def num_joints(self) -> int:
@@ -222,7 +222,7 @@ class LeaderDevice(HapticDeviceBase):
         return pose
 
     def check_limits(self, q: Array) -> None:
-        lower, upper = self.joint_table[[_LOWER_ROW, _UPPER_ROW]]
+        lower, upper = self.joint_table[[_MIN_Q_ROW, _MAX_Q_ROW]]
         for k in np.flatnonzero((q < lower) | (q > upper)):
             raise DrakeTeleopError(
                 f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
@@ -232,7 +232,7 @@ class LeaderDevice(HapticDeviceBase):
             )
 
     def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
-        return ((q < self.joint_table[_LOWER_ROW]) | (q > self.joint_table[_UPPER_ROW])).any(axis=1)
+        return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, self.num_joints))
@@ -243,7 +243,7 @@ class LeaderDevice(HapticDeviceBase):
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        own = self.joint_table[_VISCOUS_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
+        own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
         return np.diag(own + creeping * self.joint_table[_COULOMB_ROW] / FRICTION_TANH_SPEED)
 
 
@@ -255,7 +255,7 @@ def make_joint_table(
     `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
     the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
     """
-    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_FREQUENCY_HZ
+    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
     return np.array([*rows, np.full(len(home), carried)])
 
@@ -313,6 +313,6 @@ class LeaderDisplay(ForceDisplay):
     def _wrench_to_display(self, context: Context) -> Array:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
+            _limit_wrench_to_motor_torques(*self._constants, q, wrench, self._shortened)
             return self._shortened
         return wrench

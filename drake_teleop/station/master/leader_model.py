@@ -122,9 +122,9 @@ class Leader:
         phi[[4, 7, 9]] += hand_inertia
         held = arm_without_hand.with_load(phi)
         coulomb, viscous = (
-            self._values_per_joint(name, arm, 0.0) for name in ("friction", "damping")
+            self._setting_per_joint(name, arm, 0.0) for name in ("friction", "damping")
         )
-        limit = self._values_per_joint("torque_limit", arm, arm.effort_limit)
+        limit = self._setting_per_joint("torque_limit", arm, arm.effort_limit)
         joint_table = make_joint_table(held, home, coulomb, viscous, limit, self.weight_carried)
         parameters = np.zeros(NUM_DEVICE_PARAMETERS)
         parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
@@ -135,11 +135,11 @@ class Leader:
 
     def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._values_per_joint("home", arm, 0.0)
+            return self._setting_per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, arm.middle_positions)
 
-    def _values_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+    def _setting_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(

@@ -31,10 +31,10 @@ from drake_teleop.common.vectors import (
     solve_by_cholesky,
 )
 from drake_teleop.station.master.device_parameters import (
-    COULOMB_SLOTS,
+    DAMPING_SLOTS,
+    DRY_FRICTION_SLOTS,
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
-    VISCOUS_SLOTS,
     end_stop_force,
 )
 
@@ -64,23 +64,23 @@ PEAK_WRIST_TORQUES_N_M = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5,
 #: Posture with R_BE = identity, in the middle of the workspace.
 HOME_POSTURE_RAD = np.zeros(6)
 
-# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED_RAD_S): a slower device creeps.
-FRICTION_SPEED_RAD_S = 0.01  # rad/s, estimate
+# Coulomb friction is proportional to tanh(velocity / FRICTION_TANH_RAD_S): a slower device creeps.
+FRICTION_TANH_RAD_S = 0.01  # rad/s, estimate
 # End stops: spring and damper that never pull, estimate: 7 kN/m at the tip.
-_STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
-_WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
+_MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD = 300.0, 1.5  # main axes
+_WRIST_STOP_STIFFNESS_N_M_RAD, _WRIST_STOP_DAMPING_N_M_S_RAD = 5.0, 0.01
 
-# M11 = _M11_CONSTANT + _M11_Q2 cos 2 q2 + _M11_Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
+# M11 = _M11_CONSTANT + _M11_COS2Q2 cos 2 q2 + _M11_COS2Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
 _M11_CONSTANT = INERTIA_BASE_YY + 0.5 * (
     sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
     + L1**2 * (MASS_A + MASS_C / 4)
     + L2**2 * MASS_A / 4
     + L3**2 * MASS_C
 )
-_M11_Q2 = 0.5 * (
+_M11_COS2Q2 = 0.5 * (
     INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + L1**2 * (MASS_A + MASS_C / 4)
 )
-_M11_Q3 = 0.5 * (
+_M11_COS2Q3 = 0.5 * (
     INERTIA_A[1]
     - INERTIA_A[2]
     + INERTIA_DF[1]
@@ -91,7 +91,7 @@ _M11_Q3 = 0.5 * (
 _M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
 _M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_MOTOR_INERTIA_1, _MOTOR_INERTIA_2, _MOTOR_INERTIA_3 = (
+_REFLECTED_MOTOR_INERTIA_1, _REFLECTED_MOTOR_INERTIA_2, _REFLECTED_MOTOR_INERTIA_3 = (
     gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS
 )
 _GRAVITY_TORQUE_2 = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
@@ -103,8 +103,8 @@ def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
     M[0, 0] = (
         _M11_CONSTANT
-        + _M11_Q2 * math.cos(2.0 * q[1])
-        + _M11_Q3 * math.cos(2.0 * q[2])
+        + _M11_COS2Q2 * math.cos(2.0 * q[1])
+        + _M11_COS2Q3 * math.cos(2.0 * q[2])
         + 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
     )
     M[1, 1] = _M22
@@ -138,9 +138,9 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_axes_mass_matrix_into(q, M)
-    M[0, 0] += _MOTOR_INERTIA_1
-    M[1, 1] += _MOTOR_INERTIA_2
-    M[2, 2] += _MOTOR_INERTIA_3
+    M[0, 0] += _REFLECTED_MOTOR_INERTIA_1
+    M[1, 1] += _REFLECTED_MOTOR_INERTIA_2
+    M[2, 2] += _REFLECTED_MOTOR_INERTIA_3
     tip_mass = WRIST_MASS_KG + hand_mass
     for j in range(6):
         # Joint j carries the wrist links from max(j, 3) on.
@@ -163,11 +163,11 @@ def gravity_torque_into(q, out):
 
 
 @njit(cache=True)
-def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
+def _subtract_coriolis_torque(q, v, J, hand_mass, hand_inertia, torque):
     # Main axes: Christoffel symbols of their closed-form M.
     coupling = _M23_MAX * math.cos(q[1] - q[2])
-    yaw_2 = -2.0 * (_M11_Q2 * math.sin(2.0 * q[1]) + _M23_MAX * math.sin(q[1]) * math.sin(q[2]))
-    yaw_3 = -2.0 * (_M11_Q3 * math.sin(2.0 * q[2]) - _M23_MAX * math.cos(q[1]) * math.cos(q[2]))
+    yaw_2 = -2.0 * (_M11_COS2Q2 * math.sin(2.0 * q[1]) + _M23_MAX * math.sin(q[1]) * math.sin(q[2]))
+    yaw_3 = -2.0 * (_M11_COS2Q3 * math.sin(2.0 * q[2]) - _M23_MAX * math.cos(q[1]) * math.cos(q[2]))
     torque[0] -= (yaw_2 * v[1] + yaw_3 * v[2]) * v[0]
     torque[1] -= coupling * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
     torque[2] -= -coupling * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]
@@ -201,9 +201,9 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
 @njit(cache=True)
 def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
-        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED_RAD_S) + viscous[i] * v[i]
-        stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
-        damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
+        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_RAD_S) + viscous[i] * v[i]
+        stiffness = _MAIN_STOP_STIFFNESS_N_M_RAD if i < 3 else _WRIST_STOP_STIFFNESS_N_M_RAD
+        damping = _MAIN_STOP_DAMPING_N_M_S_RAD if i < 3 else _WRIST_STOP_DAMPING_N_M_S_RAD
         torque[i] += end_stop_force(
             q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
         )
@@ -212,8 +212,8 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
         v[1] - v[2],
         FIVE_BAR_RANGE_RAD[0],
         FIVE_BAR_RANGE_RAD[1],
-        _STOP_STIFFNESS,
-        _STOP_DAMPING,
+        _MAIN_STOP_STIFFNESS_N_M_RAD,
+        _MAIN_STOP_DAMPING_N_M_S_RAD,
     )
     torque[1] += five_bar
     torque[2] -= five_bar
@@ -233,8 +233,8 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
-    _add_friction_and_end_stops(q, v, device[COULOMB_SLOTS], device[VISCOUS_SLOTS], vdot)
+    _subtract_coriolis_torque(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
+    _add_friction_and_end_stops(q, v, device[DRY_FRICTION_SLOTS], device[DAMPING_SLOTS], vdot)
     solve_by_cholesky(M, vdot, 6)
 
 

@@ -17,23 +17,23 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross, plus, scale_vector
 from drake_teleop.station.master.device_parameters import (
-    COULOMB_SLOTS,
+    DAMPING_SLOTS,
+    DRY_FRICTION_SLOTS,
     HALF_WORKSPACE_SLOTS,
     HAND_INERTIA_SLOT,
     HAND_MASS_SLOT,
     INERTIA_SLOT,
     MASS_SLOT,
     MAX_ROTATION_SLOTS,
-    VISCOUS_SLOTS,
     WORKSPACE_CENTRE_SLOTS,
     end_stop_force,
 )
 
-# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED_M_S): a slower device creeps.
-FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
+# Coulomb friction is proportional to tanh(speed / FRICTION_TANH_M_S): a slower device creeps.
+FRICTION_TANH_M_S, FRICTION_TANH_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
 # End stops: spring and damper that never pull, estimate.
 _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M = 5000.0, 20.0  # N/m, N s/m
-_ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
+_STOP_STIFFNESS_N_M_RAD, _STOP_DAMPING_N_M_S_RAD = 5.0, 0.01  # N m/rad, N m s/rad
 
 
 @njit(cache=True)
@@ -58,7 +58,7 @@ def mass_matrix_into(q, J, device, M):
 
 
 @njit(cache=True)
-def _drag_coefficient(motion, coulomb, viscous, speed_of_tanh):
+def _friction_force_per_speed(motion, coulomb, viscous, speed_of_tanh):
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / speed_of_tanh
@@ -70,8 +70,8 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS_SLOT] + device[HAND_MASS_SLOT]
-    drag = _drag_coefficient(
-        v[:3], device[COULOMB_SLOTS.start], device[VISCOUS_SLOTS.start], FRICTION_SPEED_M_S
+    drag = _friction_force_per_speed(
+        v[:3], device[DRY_FRICTION_SLOTS.start], device[DAMPING_SLOTS.start], FRICTION_TANH_M_S
     )
     for i in range(3):
         x, half = q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
@@ -85,18 +85,18 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _drag_coefficient(
+    drag = _friction_force_per_speed(
         omega,
-        device[COULOMB_SLOTS.start + 3],
-        device[VISCOUS_SLOTS.start + 3],
-        FRICTION_SPEED_RAD_S,
+        device[DRY_FRICTION_SLOTS.start + 3],
+        device[DAMPING_SLOTS.start + 3],
+        FRICTION_TANH_RAD_S,
     )
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
     for i in range(3):
         half = device[MAX_ROTATION_SLOTS][i]
         torque[i] = motor[3 + i] + end_stop_force(
-            q[3 + i], v[3 + i], -half, half, _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
+            q[3 + i], v[3 + i], -half, half, _STOP_STIFFNESS_N_M_RAD, _STOP_DAMPING_N_M_S_RAD
         )
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
@@ -126,8 +126,8 @@ def pose_into(q, pose):
 def damping_matrix(q: Array, device: Array, creeping: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
-    of_tanh = np.array([FRICTION_SPEED_M_S, FRICTION_SPEED_RAD_S])
-    drag = device[VISCOUS_SLOTS][[0, 3]] + creeping * device[COULOMB_SLOTS][[0, 3]] / of_tanh
+    of_tanh = np.array([FRICTION_TANH_M_S, FRICTION_TANH_RAD_S])
+    drag = device[DAMPING_SLOTS][[0, 3]] + creeping * device[DRY_FRICTION_SLOTS][[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
 
@@ -139,7 +139,7 @@ def inverse_kinematics(pose: Array, device: Array) -> Array:
     return q
 
 
-def _is_outside(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
+def _is_past_end_stop(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
     centre = np.append(device[WORKSPACE_CENTRE_SLOTS], np.zeros(3))
     half = np.append(device[HALF_WORKSPACE_SLOTS], device[MAX_ROTATION_SLOTS])
     return np.abs(q - centre) > half + margin
@@ -147,12 +147,12 @@ def _is_outside(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
 
 def is_at_end_stop(q: Array, device: Array) -> NDArray[np.bool_]:
     return (
-        _is_outside(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION_SLOTS] > 0.0)
+        _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION_SLOTS] > 0.0)
     ).any(axis=1)
 
 
 def check_limits(q: Array, device: Array) -> None:
-    if _is_outside(q, device, 1e-9).any():
+    if _is_past_end_stop(q, device, 1e-9).any():
         low, high = (
             device[WORKSPACE_CENTRE_SLOTS] - device[HALF_WORKSPACE_SLOTS],
             device[WORKSPACE_CENTRE_SLOTS] + device[HALF_WORKSPACE_SLOTS],

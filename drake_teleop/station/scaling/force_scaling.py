@@ -42,11 +42,11 @@ from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, sensor_
 
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
 _CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-_NUM_SCALES = 6
+_NUM_BLENDED_SCALES = 6
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE_S = 0.05
-_NO_FAULT, _STALE_FAULT, _READING_FAULT, _JOINTS_FAULT, _LOAD_FAULT = map(
+_NO_FAULT, _STALE_SAMPLE_FAULT, _BAD_READING_FAULT, _BAD_JOINTS_FAULT, _BAD_LOAD_FAULT = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
 )
 
@@ -151,9 +151,9 @@ def blend_scales_at(change, time, scales):
     """
     u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
-    for i in range(_NUM_SCALES):
+    for i in range(_NUM_BLENDED_SCALES):
         # Exact at both ends, so that unchanged scales equal the configured ones.
-        scales[i] = (1.0 - share) * change[i] + share * change[_NUM_SCALES + i]
+        scales[i] = (1.0 - share) * change[i] + share * change[_NUM_BLENDED_SCALES + i]
 
 
 @njit(cache=True)
@@ -183,22 +183,22 @@ def find_sample_fault(sample, estimate, time, valid_range):
     `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
     """
     if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
-        return _STALE_FAULT
+        return _STALE_SAMPLE_FAULT
     reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and all_in_range(
         sample[SAMPLE_MOTION]
     )
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
-        return _READING_FAULT
+        return _BAD_READING_FAULT
     if not all_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
-        return _JOINTS_FAULT
-    return _NO_FAULT if all_in_range(estimate) else _LOAD_FAULT
+        return _BAD_JOINTS_FAULT
+    return _NO_FAULT if all_in_range(estimate) else _BAD_LOAD_FAULT
 
 
 @njit(cache=True)
 def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out):
-    scales = np.empty(_NUM_SCALES)
+    scales = np.empty(_NUM_BLENDED_SCALES)
     blend_scales_at(change, time, scales)
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
 
@@ -316,7 +316,7 @@ class ForceScaling(LeafSystem):
                 remedy="give finite numbers of 0 or more",
             )
         parameter = context.get_mutable_numeric_parameter(self._change)
-        now, start = np.empty(_NUM_SCALES), context.get_time()
+        now, start = np.empty(_NUM_BLENDED_SCALES), context.get_time()
         blend_scales_at(parameter.value(), start, now)
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 

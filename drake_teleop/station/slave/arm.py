@@ -40,7 +40,7 @@ from drake_teleop.station.slave.joint_friction import dry_friction
     PHI_COLUMN,
     ROTOR_COLUMN,
     DAMPING_COLUMN,
-    FRICTION_COLUMN,
+    DRY_FRICTION_COLUMN,
     IS_PRISMATIC_COLUMN,
 ) = 0, 9, 12, 22, 23, 24, 25
 NUM_TABLE_COLUMNS = 26
@@ -168,7 +168,7 @@ def sensor_acceleration_into(table: Array, q: Array, s: Array, out: Array) -> No
 
 
 @njit(cache=True, inline="always")
-def _set_world_at_rest(table: Array, x: Array) -> None:
+def _write_motion_of_world_at_rest(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN + k]
@@ -223,7 +223,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write specific force s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows, to out (21,)."""
     n = table.shape[0] - 1
-    _set_world_at_rest(table, out)
+    _write_motion_of_world_at_rest(table, out)
     for row in range(n):
         _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], out)
     _advance_motion_over_joint(table, n, 0.0, 0.0, 0.0, out)
@@ -236,7 +236,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the state [s, omega, alpha, p_WL, R_WL] of each link, and of S, to out (n+1, 21)."""
     n = table.shape[0] - 1
-    _set_world_at_rest(table, out[0])
+    _write_motion_of_world_at_rest(table, out[0])
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
@@ -268,7 +268,7 @@ def _write_joint_axis_and_link_wrench(table: Array, row: int, x: Array, link: Ar
 
 
 @njit(cache=True)
-def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
+def _project_wrenches_on_joints(table: Array, link: Array, tau: Array) -> None:
     """Sum the link wrenches from tip to base and project them to joint torques tau (n,) [N m]."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
@@ -295,14 +295,14 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _set_world_at_rest(table, x)
+    _write_motion_of_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
             _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], x)
         else:
             _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
         _write_joint_axis_and_link_wrench(table, row, x, link)
-    _project_on_joints(table, link, tau_out)
+    _project_wrenches_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR_COLUMN] * vdot[row] + table[row, DAMPING_COLUMN] * v[row]
 
@@ -402,7 +402,7 @@ def forward_dynamics(
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _set_world_at_rest(table, x)
+    _write_motion_of_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
             _advance_motion_over_joint(table, row, q[row], v[row], 0.0, x)
@@ -412,11 +412,11 @@ def forward_dynamics(
         _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
-    _project_on_joints(table, link, vdot_out)
+    _project_wrenches_on_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING_COLUMN] * v[row]
-        if table[row, FRICTION_COLUMN] != 0.0:
-            vdot_out[row] += dry_friction(table[row, FRICTION_COLUMN], v[row])
+        if table[row, DRY_FRICTION_COLUMN] != 0.0:
+            vdot_out[row] += dry_friction(table[row, DRY_FRICTION_COLUMN], v[row])
     _mass_matrix(table, link, inertia, M)
     solve_positive_definite(M, vdot_out)
 

@@ -35,14 +35,14 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
 )
 
-_DEFAULT_SPEED_RAD_S = np.pi
-_DEFAULT_HALF_RANGE_M, _DEFAULT_SPEED_M_S = 1.0, 1.0  # of a prismatic joint
+_DEFAULT_SPEED_LIMIT_RAD_S = np.pi
+_DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
-_MAX_PLAUSIBLE_POSITION_LIMIT = 1e4
+_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
 # Default time to full speed [s].
-_TIME_TO_FULL_SPEED_S = 0.4
+_DEFAULT_TIME_TO_SPEED_LIMIT_S = 0.4
 
 
 def ArmModelFromPlant(
@@ -69,7 +69,7 @@ def ArmModelFromPlant(
     n = len(joints)
     table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
-        table[row, ROTOR_COLUMN] = _reflected_inertia(plant, joint)
+        table[row, ROTOR_COLUMN] = _reflected_rotor_inertia(plant, joint)
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
@@ -99,7 +99,7 @@ def ArmModelFromPlant(
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
-    lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
+    lower, upper = np.array([_joint_position_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -113,14 +113,14 @@ def ArmModelFromPlant(
     )
 
 
-def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+def _joint_position_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
     return (
-        -np.inf if lower < -_MAX_PLAUSIBLE_POSITION_LIMIT else lower,
-        np.inf if upper > _MAX_PLAUSIBLE_POSITION_LIMIT else upper,
+        -np.inf if lower < -_MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else lower,
+        np.inf if upper > _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M else upper,
     )
 
 
@@ -194,7 +194,7 @@ def _actuators_of_joint(plant: MultibodyPlant, joint: Joint) -> list[JointActuat
     return [a for a in actuators if a.joint().index() == joint.index()]
 
 
-def _reflected_inertia(plant: MultibodyPlant, joint: Joint) -> float:
+def _reflected_rotor_inertia(plant: MultibodyPlant, joint: Joint) -> float:
     return sum(a.default_reflected_inertia() for a in _actuators_of_joint(plant, joint))
 
 
@@ -202,7 +202,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
-def fill_missing_limits(
+def fill_missing_joint_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
@@ -213,7 +213,7 @@ def fill_missing_limits(
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_limits`
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_position_limits`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -223,7 +223,7 @@ def fill_missing_limits(
             where=where,
             remedy="correct the limits, or make the joint a fixed one",
         )
-    reach = _DEFAULT_HALF_RANGE_M
+    reach = _DEFAULT_JOINT_HALF_RANGE_M
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
@@ -232,7 +232,7 @@ def fill_missing_limits(
         np.where(half_limited & np.isinf(lower), upper - width, lower),
         np.where(half_limited & np.isinf(upper), lower + width, upper),
     )
-    speed = np.where(slides, _DEFAULT_SPEED_M_S, _DEFAULT_SPEED_RAD_S)
+    speed = np.where(slides, _DEFAULT_SPEED_LIMIT_M_S, _DEFAULT_SPEED_LIMIT_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit
@@ -250,21 +250,21 @@ def fill_missing_limits(
         upper=upper,
         velocity_limit=velocity,
         acceleration_limit=np.where(
-            _is_positive_and_finite(specified), specified, velocity / _TIME_TO_FULL_SPEED_S
+            _is_positive_and_finite(specified), specified, velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
         ),
         effort_limit=effort,
     )
     plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_RANGE_RAD)
     acceleration_text = (
-        f"acceleration limits that reach full speed in {_TIME_TO_FULL_SPEED_S:g} s{hint}"
+        f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"
     )
     for missing, revolute_text, prismatic_text in (
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
         (
             ~_is_positive_and_finite(arm.velocity_limit),
-            f"a speed limit of {_DEFAULT_SPEED_RAD_S:.4g} rad/s",
-            f"a speed limit of {_DEFAULT_SPEED_M_S:g} m/s",
+            f"a speed limit of {_DEFAULT_SPEED_LIMIT_RAD_S:.4g} rad/s",
+            f"a speed limit of {_DEFAULT_SPEED_LIMIT_M_S:g} m/s",
         ),
         (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),

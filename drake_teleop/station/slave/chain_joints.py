@@ -27,7 +27,7 @@ from drake_teleop.station.slave.model.repair_report import join_names
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG = 0.14
-_SLIDER_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
+_SLIDER_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
 def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
@@ -119,7 +119,7 @@ def check_chain(
             )
 
 
-def weld_joints_at(
+def weld_held_joints(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
     """Weld the joints named in `hold` at its positions [rad, m]; return notes for the user."""
@@ -146,7 +146,7 @@ def weld_joints_at(
     return [f"held at {position:g}: {name}" for name, position in hold.items()]
 
 
-def weld_other_joints(
+def weld_joints_outside_chain(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
     """Weld moving joints that are in neither `before` nor `chain`; return notes for the user."""
@@ -242,13 +242,13 @@ def assume_rotor_inertias(
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
-        motor[joint.index()].set_default_rotor_inertia(_SLIDER_MASS_KG if slides else inertia)
+        motor[joint.index()].set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
     return [
         f"{what}, as the model has no inertia there, for {join_names(names)}"
         for what, names in (
             (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
-            (f"a moved mass of {_SLIDER_MASS_KG:g} kg", sliding),
+            (f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg", sliding),
         )
         if names
     ]

@@ -20,9 +20,9 @@ _MIN_MASS_MATRIX_EIGENVALUE_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
-_TRIED_RANGE_SHARES = (0.7, 0.9, 1.0)
+_SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)
 #: Elbow up, reaching forward [rad]; home is the branch nearest to it.
-_Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
+_ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 def positions_with_tool_down(
@@ -30,10 +30,10 @@ def positions_with_tool_down(
 ) -> tuple[Array, IkStatus]:
     """Return joint positions (n,) [rad] for S at `position` (W) [m] and `R_WS`, and `IkStatus`."""
     if has_closed_form(arm):
-        return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
+        return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
     middle = arm.middle_positions
-    for share in _TRIED_RANGE_SHARES:
+    for share in _SEARCHED_JOINT_RANGE_SHARES:
         lower, upper = (middle + share * (limit - middle) for limit in (arm.lower, arm.upper))
         inside = replace(arm, lower=lower, upper=upper)
         q, status = find_posture(inside, pose, middle)
@@ -79,7 +79,7 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     return q
 
 
-def check_motor_strength(arm: ArmModel, q: Array) -> None:
+def check_holding_torque(arm: ArmModel, q: Array) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
         raise DrakeTeleopError(

@@ -25,13 +25,13 @@ UPPER_ARM_LENGTH_M = 0.450
 """Shoulder to elbow [m]."""
 FOREARM_LENGTH_M = 0.450
 """Elbow to wrist centre [m]."""
-FLANGE_OFFSET_M = 0.085
+WRIST_TO_S_M = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
-_MAX_SINGULAR_DISTANCE_OR_SINE = 1e-9
+_MAX_SINGULAR_DISTANCE_OR_SIN_Q5 = 1e-9
 # Tolerance of a joint limit [rad]; the angle is clipped to the limit.
-_LIMIT_TOLERANCE_RAD = 1e-9
+_JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
@@ -72,9 +72,9 @@ def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: A
     q5 <= 0. Out of reach they are those of the nearest reachable wrist centre.
     """
     status = _OK
-    x = p[0] - FLANGE_OFFSET_M * R[0, 2]
-    y = p[1] - FLANGE_OFFSET_M * R[1, 2]
-    z = p[2] - FLANGE_OFFSET_M * R[2, 2] - SHOULDER_HEIGHT_M
+    x = p[0] - WRIST_TO_S_M * R[0, 2]
+    y = p[1] - WRIST_TO_S_M * R[1, 2]
+    z = p[2] - WRIST_TO_S_M * R[2, 2] - SHOULDER_HEIGHT_M
     reach = UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M
     inner_reach = abs(UPPER_ARM_LENGTH_M - FOREARM_LENGTH_M)
     distance = np.sqrt(x * x + y * y + z * z)
@@ -84,7 +84,7 @@ def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: A
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _MAX_SINGULAR_DISTANCE_OR_SINE:
+    if rho < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
@@ -113,7 +113,7 @@ def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: A
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SINE else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5 else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -132,11 +132,11 @@ def _wrap_angle_into_limits(angle: float, near: float, lower: float, upper: floa
     """Return the angle plus full turns that is nearest to `near` within the limits, or nan."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
-    if angle > upper + _LIMIT_TOLERANCE_RAD:
-        angle -= full_turn * np.ceil((angle - upper - _LIMIT_TOLERANCE_RAD) / full_turn)
-    if angle < lower - _LIMIT_TOLERANCE_RAD:
-        angle += full_turn * np.ceil((lower - _LIMIT_TOLERANCE_RAD - angle) / full_turn)
-    if angle > upper + _LIMIT_TOLERANCE_RAD:
+    if angle > upper + _JOINT_LIMIT_TOLERANCE_RAD:
+        angle -= full_turn * np.ceil((angle - upper - _JOINT_LIMIT_TOLERANCE_RAD) / full_turn)
+    if angle < lower - _JOINT_LIMIT_TOLERANCE_RAD:
+        angle += full_turn * np.ceil((lower - _JOINT_LIMIT_TOLERANCE_RAD - angle) / full_turn)
+    if angle > upper + _JOINT_LIMIT_TOLERANCE_RAD:
         return np.nan
     return min(max(angle, lower), upper)
 
@@ -169,7 +169,7 @@ def _nearest_branch_into(
     if best < 0:
         return _JOINT_LIMIT
     copy_into(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SINE:
+    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
         status = max(status, _WRIST_SINGULAR)
     return status
 
@@ -224,7 +224,7 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    At a joint limit the command stays and does not jump to another solution (`MAX_JOINT_STEP_RAD`).
+    At a joint limit the command stays and does not jump to another solution (`MAX_JOINT_JUMP_RAD`).
 
     .. pydrake_system::
 
@@ -239,7 +239,7 @@ class InverseKinematics(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    MAX_JOINT_STEP_RAD = 2.0
+    MAX_JOINT_JUMP_RAD = 2.0
     """Largest joint displacement [rad]; joints 4 and 6 may need 90 degrees past q5 = 0."""
 
     def __init__(self, lower: Array, upper: Array) -> None:
@@ -258,7 +258,7 @@ class InverseKinematics(LeafSystem):
             self._position.Eval(context),
             self._lower,
             self._upper,
-            self.MAX_JOINT_STEP_RAD,
+            self.MAX_JOINT_JUMP_RAD,
             q,
         )
 

@@ -35,7 +35,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
-_RANGE_TOLERANCE_SHARE = 0.01
+_JOINT_RANGE_TOLERANCE_SHARE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
@@ -111,7 +111,7 @@ class JointRangeMonitor(LeafSystem):
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
-        tolerance = _RANGE_TOLERANCE_SHARE * (arm.upper - arm.lower)
+        tolerance = _JOINT_RANGE_TOLERANCE_SHARE * (arm.upper - arm.lower)
         self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)

@@ -27,7 +27,7 @@ from drake_teleop.station.slave.position_servo import (
     PositionServo,
 )
 
-COMPUTED_TORQUE_NAME = "computed_torque"
+COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 
 
 @settings
@@ -42,8 +42,8 @@ class JointControlConfig:
         70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
     )
     servo: str = choice(
-        COMPUTED_TORQUE_NAME,
-        (COMPUTED_TORQUE_NAME, *POSITION_INTERFACES, "position"),
+        COMPUTED_TORQUE_SERVO_NAME,
+        (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACES, "position"),
         "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
         " position for the fields of `interface`",
     )
@@ -51,7 +51,7 @@ class JointControlConfig:
 
     @property
     def position_interface(self) -> PositionInterface | None:
-        if self.servo == COMPUTED_TORQUE_NAME:
+        if self.servo == COMPUTED_TORQUE_SERVO_NAME:
             return None
         return self.interface or POSITION_INTERFACES.get(self.servo, PositionInterface())
 
@@ -75,7 +75,7 @@ class JointControlConfig:
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
-        if self.servo == COMPUTED_TORQUE_NAME and self.interface is not None:
+        if self.servo == COMPUTED_TORQUE_SERVO_NAME and self.interface is not None:
             raise DrakeTeleopError(
                 "the servo computed_torque has bandwidths, but no position interface",
                 where=f"{where}.interface",
@@ -87,11 +87,11 @@ class JointControlConfig:
 
     def check_computed_torque(self, what: str) -> None:
         """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
-        if self.servo != COMPUTED_TORQUE_NAME:
+        if self.servo != COMPUTED_TORQUE_SERVO_NAME:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
                 where="joint_control.servo",
-                remedy=f"choose {COMPUTED_TORQUE_NAME}, with a position_bandwidth_hz of"
+                remedy=f"choose {COMPUTED_TORQUE_SERVO_NAME}, with a position_bandwidth_hz of"
                 f" {1 / (2 * np.pi * self.tracking_delay_s):.2g} for the same lag; `run` supports"
                 " every servo",
             )
@@ -212,7 +212,7 @@ def MakeJointControl(
     return PositionServo(arm, interface, period, q_start)
 
 
-def position_interface_of_block(block: Mapping[str, Any] | None) -> PositionInterface | None:
+def position_interface_of_servo(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the position interface that `servo` in a `joint_control` block names, or None."""
     return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 

@@ -20,8 +20,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave.chain_joints import check_joints_form_tree
 from drake_teleop.station.slave.drake_errors import (
-    EXPECTED_ROBOT,
-    EXPECTED_SCENE,
+    ROBOT_ERROR_TEXTS,
+    SCENE_ERROR_TEXTS,
     raise_logged_errors,
     translate_drake_errors,
 )
@@ -70,12 +70,12 @@ def repair_and_parse_model(
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     files.add_packages_to_map(parser.package_map())
-    files.check_file(path)
+    files.check_referenced_files(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
-    expected = EXPECTED_SCENE if purpose.is_scene else EXPECTED_ROBOT
+    expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     with translate_drake_errors(path, expected, folder.name):
-        read = _add_directives if kind == ".yaml" else _add_file
+        read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
         instances, repaired = read(parser, path, files, purpose, folder)
         check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
@@ -95,7 +95,7 @@ def repair_and_parse_model(
     )
 
 
-def _add_file(
+def _add_repaired_file(
     parser: Parser,
     path: Path,
     files: ModelFiles,
@@ -112,7 +112,7 @@ def _add_file(
     return instances, [repaired]
 
 
-def _add_directives(
+def _add_files_of_directives(
     parser: Parser,
     path: Path,
     files: ModelFiles,
@@ -121,7 +121,7 @@ def _add_directives(
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
-    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)
+    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(is_in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
         file = files.find_file(added.file)
         if file is None:

@@ -19,14 +19,14 @@ from drake_teleop.station.slave.chain_joints import (
     set_one_actuator_per_joint,
     weld_base_and_find_chain,
     weld_free_bodies,
-    weld_joints_at,
-    weld_other_joints,
+    weld_held_joints,
+    weld_joints_outside_chain,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 from drake_teleop.station.slave.model_files import repair_and_parse_model
 
-_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
+_MAX_SUGGESTED_FRAME_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ def ParseModel(
     read = repair_and_parse_model(plant, path, package_paths, ModelPurpose(sensor_frame, hold))
     frame = _find_sensor_frame(plant, read.instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
-    held = weld_joints_at(plant, hold, added)
+    held = weld_held_joints(plant, hold, added)
     chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
     check_chain(plant, chain, read.dependence_reasons, where)
     free = weld_free_bodies(plant, read.instances)
     with translate_drake_errors(path):
-        held += weld_other_joints(plant, before, chain)
+        held += weld_joints_outside_chain(plant, before, chain)
         set_one_actuator_per_joint(plant, chain, read.effort_limits)
         rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary_bodies)
     instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
@@ -104,7 +104,7 @@ def ParseTool(
             remedy="give one tree of links; its root is welded to the sensor frame",
         )
     with translate_drake_errors(path):
-        assumptions = [*read.assumptions, *weld_other_joints(plant, before, [])]
+        assumptions = [*read.assumptions, *weld_joints_outside_chain(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     return ParsedTool(roots[0], assumptions, read.mesh_folder)
@@ -132,7 +132,7 @@ def _find_sensor_frame(
     # Without names that Drake creates for joints.
     ends = ("_parent", "_child", "__model__")
     named = sorted(each for each in names if not each.endswith(ends))
-    nearest = difflib.get_close_matches(name, named, n=_MAX_LISTED_NAMES, cutoff=0.0)
+    nearest = difflib.get_close_matches(name, named, n=_MAX_SUGGESTED_FRAME_NAMES, cutoff=0.0)
     known = ", ".join(sorted(nearest))
     raise DrakeTeleopError(
         f"{len(with_frame) or 'no'} frames are named {name!r}",

@@ -38,25 +38,25 @@ POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
 # Largest error that is rounding only [m].
-_ROUNDING_ERROR_M = 1e-14
+_POSE_ROUNDING_ERROR_M = 1e-14
 MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
-MAX_STEPS_PER_COMMAND = 10
+MAX_SOLVER_STEPS_PER_COMMAND = 10
 """Maximum number of Levenberg-Marquardt steps per command; two or three are typical."""
 # Minimum damping of a step [m^2], which keeps redundant joints at rest.
-_MIN_DAMPING = 1e-14
+_MIN_STEP_DAMPING_M2 = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
-_INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
+_INITIAL_RELATIVE_DAMPING, _NUM_STEPS_PER_SEARCH_START, _NUM_SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_MAX_ZERO_GRADIENT_M = 1e-3
+_ZERO_GRADIENT_RATIO_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
-_REACH_TOLERANCE_M = 5e-6
+_UNREACHED_ERROR_M = 5e-6
 # The same tolerance for `find_posture`, which stops the search earlier [m].
-_SEARCH_TOLERANCE_M = 1e-3
+_SEARCH_UNREACHED_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
-_MAX_ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
+_MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
-_MAX_COPLANAR_VOLUME = 0.1
+_MAX_SINGULAR_WRIST_TRIPLE_PRODUCT = 0.1
 
 (
     _STATUS_OK,
@@ -70,7 +70,7 @@ _MAX_COPLANAR_VOLUME = 0.1
 
 
 @njit(cache=True)
-def _jacobian_and_error(table, L, pose, q, x, J, e):
+def _jacobian_and_pose_error(table, L, pose, q, x, J, e):
     """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
@@ -91,7 +91,7 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 
 @njit(cache=True)
-def _gram_matrix_into(J, H):
+def _smaller_gram_matrix_into(J, H):
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -117,7 +117,7 @@ def _find_smallest_eigenpair(H, u):
         for i in range(m):
             for k in range(m):
                 M[i, k] = H[i, k]
-            M[i, i] += _MIN_DAMPING
+            M[i, i] += _MIN_STEP_DAMPING_M2
         solve_positive_definite(M, u)
         growth = 0.0
         for i in range(m):
@@ -125,11 +125,11 @@ def _find_smallest_eigenpair(H, u):
         growth = np.sqrt(growth)
         for i in range(m):
             u[i] /= growth
-    return max(1.0 / growth - _MIN_DAMPING, 0.0)
+    return max(1.0 / growth - _MIN_STEP_DAMPING_M2, 0.0)
 
 
 @njit(cache=True)
-def _is_held_at_limit(q, lower, upper, i, push):
+def _is_joint_held_at_limit(q, lower, upper, i, push):
     return (push > 0.0 and q[i] >= upper[i]) or (push < 0.0 and q[i] <= lower[i])
 
 
@@ -142,7 +142,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):
-        held[i] = _is_held_at_limit(q, lower, upper, i, g[i])
+        held[i] = _is_joint_held_at_limit(q, lower, upper, i, g[i])
     outside = True
     while outside:
         for i in range(n):
@@ -175,10 +175,10 @@ def _best_step_of_joint(J, e, i):
 
 
 @njit(cache=True)
-def _singularity_status(L, J):
+def _wrist_or_shoulder_status(L, J):
     n = J.shape[1]
     a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
-    coplanar = abs(dot(a, cross(b, c))) < _MAX_COPLANAR_VOLUME * L**3
+    coplanar = abs(dot(a, cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
@@ -214,7 +214,7 @@ def follow_pose(
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
     if towards_posture:
         if upper[n - 1] - lower[n - 1] == np.inf:
-            _jacobian_and_error(table, L, pose, q, x, J, e)
+            _jacobian_and_pose_error(table, L, pose, q, x, J, e)
         for i in range(n):
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
@@ -225,30 +225,30 @@ def follow_pose(
             q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _jacobian_and_error(table, L, pose, q, x, J, e)
-    _gram_matrix_into(J, B)
+    squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
+    _smaller_gram_matrix_into(J, B)
     damping = max(singular * singular - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
         copy_into(anchor, 0, q, 0, n)
-        cost, relative_damping, stalled_steps, better = squared, _INITIAL_DAMPING, 0, True
+        cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
         for _ in range(steps):
             if (
-                squared < _ROUNDING_ERROR_M * _ROUNDING_ERROR_M
+                squared < _POSE_ROUNDING_ERROR_M * _POSE_ROUNDING_ERROR_M
                 or stalled_steps > 3
                 or relative_damping > 1e9
             ):
                 break
             if better:
-                _gram_matrix_into(J, H)
+                _smaller_gram_matrix_into(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i])
                     for k in range(6):
                         g[i] += J[k, i] * e[k]
-            stiff = damping + max(_MIN_DAMPING, relative_damping * squared)
-            if _damped_step(H, g, stiff, q, low, high, trial) < _ROUNDING_ERROR_M:
+            stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
+            if _damped_step(H, g, stiff, q, low, high, trial) < _POSE_ROUNDING_ERROR_M:
                 break
-            found = _jacobian_and_error(table, L, pose, trial, x, J, e)
+            found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
@@ -258,8 +258,8 @@ def follow_pose(
                 squared, cost, relative_damping = found, total, 0.2 * relative_damping
                 copy_into(q, 0, trial, 0, n)
             else:
-                relative_damping = 10.0 * max(relative_damping, _INITIAL_DAMPING)
-        _jacobian_and_error(table, L, pose, q, x, J, e)
+                relative_damping = 10.0 * max(relative_damping, _INITIAL_RELATIVE_DAMPING)
+        _jacobian_and_pose_error(table, L, pose, q, x, J, e)
         p, rotation = vector_at(e, 0), vector_at(e, 3)
         if (
             dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
@@ -270,44 +270,44 @@ def follow_pose(
             # The pose has priority: repeat without the posture.
             towards_posture = False
             copy_into(q, 0, start, 0, n)
-            squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+            squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
-                return _singularity_status(L, J)
+                return _wrist_or_shoulder_status(L, J)
             copy_into(q, 0, kept, 0, n)
-            far = before > _REACH_TOLERANCE_M * _REACH_TOLERANCE_M and expected_gain < 1e-3 * before
-            return _OUT_OF_REACH if far else _singularity_status(L, J)
+            far = before > _UNREACHED_ERROR_M * _UNREACHED_ERROR_M and expected_gain < 1e-3 * before
+            return _OUT_OF_REACH if far else _wrist_or_shoulder_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
             push = 0.0
             for k in range(6):
                 push += J[k, i] * e[k]
-            if not _is_held_at_limit(q, low, high, i, push):
+            if not _is_joint_held_at_limit(q, low, high, i, push):
                 free += push * push
             elif held < 0 or lower[i] < q[i] < upper[i]:
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _MAX_ZERO_GRADIENT_M * _MAX_ZERO_GRADIENT_M * squared:
-            return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
+        if singular > 0.0 and free > _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared:
+            return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
-        expected_gain = 4.0 * free / max(damping, _MIN_DAMPING)
+        expected_gain = 4.0 * free / max(damping, _MIN_STEP_DAMPING_M2)
         copy_into(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
         _find_smallest_eigenpair(H, g)
-        size = _SEARCH_ESCAPE_STEP
+        size = _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M
         if singular > 0.0:
-            size = min(_MAX_ESCAPE_STEP, 10.0 * np.sqrt(squared) / L)
+            size = min(_MAX_SINGULARITY_ESCAPE_RAD_OR_M, 10.0 * np.sqrt(squared) / L)
         slope = 0.0
         for i in range(n):
             for k in range(6):
                 slope += g[i] * J[k, i] * e[k]
         for i in range(n):
             q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+        squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -326,25 +326,25 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
     start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
     x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
-    for k in range(_SEARCH_STARTS):
+    for k in range(_NUM_SEARCH_STARTS):
         found = follow_pose(
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
-            _SEARCH_STEPS, q,
+            _NUM_STEPS_PER_SEARCH_START, q,
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
-            return _nearest_equivalent_joints(arm, q, reference), IkStatus(found)
-        squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
+            return _nearest_joints_by_whole_turns(arm, q, reference), IkStatus(found)
+        squared = _jacobian_and_pose_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
-            if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M:
-                status = _singularity_status(L, J)
+            if squared < _SEARCH_UNREACHED_M**2 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M:
+                status = _wrist_or_shoulder_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
-    return _nearest_equivalent_joints(arm, nearest, reference), IkStatus(status)
+    return _nearest_joints_by_whole_turns(arm, nearest, reference), IkStatus(status)
 
 
-def _nearest_equivalent_joints(arm: ArmModel, q: Array, reference: Array) -> Array:
+def _nearest_joints_by_whole_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
     turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
     nearer = q + np.where(arm.table[:-1, IS_PRISMATIC_COLUMN] == 0, turns, 0.0)
     return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
@@ -372,7 +372,7 @@ def _follow_command(
     if elapsed > 0.0:  # inf * 0 is nan
         for i in range(n):
             max_step[i] = speed[i] * elapsed
-    steps = np.int64(MAX_STEPS_PER_COMMAND)  # a literal would compile `follow_pose` again
+    steps = np.int64(MAX_SOLVER_STEPS_PER_COMMAND)  # a literal would compile `follow_pose` again
     return follow_pose(
         table, L, pose, reference, lower, upper, max_step, posture, min(pull * elapsed, 1.0),
         MIN_SINGULAR_VALUE_M, steps, q,

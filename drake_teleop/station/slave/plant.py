@@ -21,15 +21,15 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, pose_into
+from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, pose_into
 from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
-    fill_missing_limits,
+    fill_missing_joint_limits,
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, find_start_posture
+from drake_teleop.station.slave.home import R_WS_HOME, check_holding_torque, find_start_posture
 from drake_teleop.station.slave.joint_friction import JointFriction, expand_friction_per_joint
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
@@ -42,7 +42,7 @@ from drake_teleop.station.slave.surroundings import (
 from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_TIP_TOLERANCE_M = 1e-3
+_SHARED_TIP_DISTANCE_M = 1e-3
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
 
@@ -84,7 +84,7 @@ class SlavePlant:
         bodies, and an empty array of given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
-        carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
+        carried.table[:-1, DRY_FRICTION_COLUMN] = self.joint_friction
         contact, no_wrenches = self.contact, np.zeros((0, 0))
         laws = contact.compiled_pairs, contact.leaf_parameters, contact.joint_table
         return carried.table, carried.phi_load_view, *laws, no_wrenches
@@ -165,14 +165,14 @@ def AddSlavePlant(
         finalize_plant(plant)
     contact = make_empty_contact_model()
     if environment is not None and surroundings is not None:
-        _remove_visuals(plant, scene_graph)
+        _remove_visual_shapes(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_arm_shapes(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
+        _remove_arm_collisions(plant, scene_graph, instance, bodies_carried_by(plant, frame.body()))
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_motor_strength(arm, start)
+        check_holding_torque(arm, start)
     friction = expand_friction_per_joint(slave.friction, arm.joint_names)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
@@ -224,7 +224,7 @@ class ParsedSlave:
                 remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
             )
         check_arm_lengths(arm, str(self.slave.path))
-        arm, assumed = fill_missing_limits(arm, str(self.slave.path))
+        arm, assumed = fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
             assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
@@ -278,13 +278,13 @@ def finalize_plant(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _remove_visual_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     for index in range(plant.num_bodies()):
         for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
-def _remove_arm_shapes(
+def _remove_arm_collisions(
     plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
 ) -> None:
     carried = {body.index() for body in load}
@@ -315,9 +315,9 @@ def _hull_corners_beyond_sensor_S(slave: Slave) -> list[Array]:
     return hulls
 
 
-def _farthest_point_along_z(hulls: list[Array]) -> Array:
+def _farthest_hull_point_along_z(hulls: list[Array]) -> Array:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_TOLERANCE_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_DISTANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
@@ -337,7 +337,7 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
     if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
-        return _farthest_point_along_z(hulls)
+        return _farthest_hull_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 

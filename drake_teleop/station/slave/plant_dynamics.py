@@ -20,7 +20,7 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
-    BODY_ROW_COLUMN,
+    BOX_BODY_ROW_COLUMN,
     NUM_PAIR_COLUMNS,
     contact_force,
     depth_of_sphere_in_box,
@@ -31,8 +31,8 @@ from drake_teleop.station.slave.surroundings import ToolContactModel
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 PROXIMITY_FAR, PROXIMITY_TOUCHING, PROXIMITY_NEAR_MONITORED = range(3)
-_MONITORED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
-_TOUCH_TOLERANCE_M = 1e-9  # m
+_NEAR_MONITORED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_MAX_TOUCHING_GAP_M = 1e-9  # m
 
 
 @njit(cache=True)
@@ -73,8 +73,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
-        if pair[BODY_ROW_COLUMN] >= 0.0:
-            body = bodies[int(pair[BODY_ROW_COLUMN])]
+        if pair[BOX_BODY_ROW_COLUMN] >= 0.0:
+            body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
             lever = minus(vector_at(normal, 3), vector_at(body, 4))
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
@@ -86,9 +86,9 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
     """Return a pair with its box at the present pose of the body, as `placed` (28,) if it moves."""
-    if pair[BODY_ROW_COLUMN] < 0.0:
+    if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
-    body = bodies[int(pair[BODY_ROW_COLUMN])]
+    body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
     copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
@@ -109,11 +109,11 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
         box = _place_box_at_body(pair, bodies, placed)
-        if min_distance_of_boxes(pair, box, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
+        if min_distance_of_boxes(pair, box, p_WS, R_WS, sheet[0]) < _NEAR_MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed)
-        if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
+        if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_MAX_TOUCHING_GAP_M:
             return PROXIMITY_TOUCHING
     return PROXIMITY_FAR
 
@@ -183,7 +183,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
         x[half - 1 : 2 * half : half],
         x[2 * half :],
     )
-    if not _take_or_request_wrench(given, x, wrench_W):
+    if not _take_or_request_given_wrench(given, x, wrench_W):
         environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
     else:
         applied = np.empty(6)
@@ -193,7 +193,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _take_or_request_wrench(given, x, wrench_W):
+def _take_or_request_given_wrench(given, x, wrench_W):
     """Copy the next wrench of `given` to `wrench_W` and return True; without one write a request.
 
     `given` is empty, or has a row [number given, number used, x of the request] and then wrenches.

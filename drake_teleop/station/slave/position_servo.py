@@ -21,9 +21,9 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
 # then target, r and dr/dt (n each), and the queue of commands.
-_PERIODS_SINCE_COMMAND_INDEX, _OLDEST_COMMAND_INDEX = 0, 1
+_PERIODS_SINCE_COMMAND_INDEX, _OLDEST_QUEUED_INDEX = 0, 1
 # Braking v^2 = 2 a d with 80 % of the largest acceleration.
-_BRAKING_FACTOR = 2 * 0.8
+_TWICE_BRAKING_SHARE = 2 * 0.8
 
 
 @settings
@@ -89,7 +89,7 @@ POSITION_INTERFACES: dict[str, PositionInterface] = {
 
 
 @njit(cache=True)
-def _generate_reference(command, interface, limits, memory, reference):
+def _advance_joint_reference(command, interface, limits, memory, reference):
     """Accept the command (n,) [rad] if one is due, and advance the reference by one period.
 
     Args:
@@ -104,16 +104,16 @@ def _generate_reference(command, interface, limits, memory, reference):
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
     if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and all_in_range(command):
         if queued > 0.0:
-            place = 2 + 3 * n + int(memory[_OLDEST_COMMAND_INDEX]) * n
+            place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
             copy_into(target, 0, memory, place, n)
             copy_into(memory, place, command, 0, n)
-            memory[_OLDEST_COMMAND_INDEX] = (memory[_OLDEST_COMMAND_INDEX] + 1.0) % queued
+            memory[_OLDEST_QUEUED_INDEX] = (memory[_OLDEST_QUEUED_INDEX] + 1.0) % queued
         else:
             copy_into(target, 0, command, 0, n)
     memory[_PERIODS_SINCE_COMMAND_INDEX] = (memory[_PERIODS_SINCE_COMMAND_INDEX] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
-        fastest = min(limits[0, i], math.sqrt(_BRAKING_FACTOR * limits[1, i] * abs(away)))
+        fastest = min(limits[0, i], math.sqrt(_TWICE_BRAKING_SHARE * limits[1, i] * abs(away)))
         towards = min(max(away / lookahead, -fastest), fastest)
         wanted = gain * lookahead * (towards - speed[i])
         wanted = min(max(wanted, -limits[1, i]), limits[1, i])
@@ -134,7 +134,7 @@ def position_servo_torque(
     readings are invalid, the torque compensates gravity.
     """
     n = torque.shape[0]
-    _generate_reference(command, interface, limits, memory, scratch)
+    _advance_joint_reference(command, interface, limits, memory, scratch)
     q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
     if all_in_range(state):
         copy_into(q, 0, state, 0, n)

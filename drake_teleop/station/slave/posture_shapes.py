@@ -52,11 +52,11 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Larger overlaps are reported [m]; smaller ones are rounding of models.
 MIN_OVERLAP_M = 1e-3
-_MAX_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
+_MAX_COLLISION_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
-_NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
-_MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
-_NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
+_NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
+_MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
+_NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 
 
 class Overlap(NamedTuple):
@@ -97,16 +97,16 @@ class PostureShapes:
         finalize_plant(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
-        self._exclude_joined_bodies()
+        self._exclude_contact_of_joined_bodies()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
         inspector = self._scene_graph.model_inspector()
         self._points = {
-            index: [surface_points(inspector, shape) for shape in self.shapes_of(index)]
+            index: [hull_points_of(inspector, shape) for shape in self.contact_shapes_of(index)]
             for index in map(BodyIndex, range(self.plant.num_bodies()))
         }
-        self._by_design = self._overlaps_by_design()
+        self._by_design = self._body_pairs_overlapping_by_design()
         names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
         if names:
             pairs = join_names(sorted(names))
@@ -114,7 +114,7 @@ class PostureShapes:
                 f"overlaps left out, as they are in nearly all postures: {pairs}"
             )
 
-    def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
+    def contact_shapes_of(self, body: BodyIndex) -> list[GeometryId]:
         inspector = self._scene_graph.model_inspector()
         shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
         return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
@@ -140,7 +140,7 @@ class PostureShapes:
         """Return the pairs of overlapping bodies, except those that nearly always overlap."""
         return [
             Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
-            for (first, second), distance in self._distances_of_bodies().items()
+            for (first, second), distance in self._body_pair_distances().items()
             if (first, second) not in self._by_design
         ]
 
@@ -153,7 +153,7 @@ class PostureShapes:
         """Return, for each shape of a body, points (k, 3) on its convex hull in W [m]."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
-            hulls = [surface_points(self._scene_graph.model_inspector(), each) for each in shapes]
+            hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
         X_WB = self.plant.EvalBodyPoseInWorld(self.context, body)
         return [(X_WB @ points.T).T for points in hulls]
 
@@ -171,7 +171,7 @@ class PostureShapes:
             plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
         )
 
-    def _distances_of_bodies(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
+    def _body_pair_distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
         query = self._scene_graph.get_query_output_port().Eval(scene)
         found: dict[tuple[BodyIndex, BodyIndex], float] = {}
@@ -182,14 +182,14 @@ class PostureShapes:
             found[first, second] = min(each.distance, found.get((first, second), np.inf))
         return found
 
-    def _exclude_joined_bodies(self) -> None:
+    def _exclude_contact_of_joined_bodies(self) -> None:
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
             return {each.index() for each in plant.GetBodiesWeldedTo(body)} - self.surroundings
 
         def shapes_of_bodies(bodies: Collection[BodyIndex]) -> GeometrySet:
-            return GeometrySet([shape for each in bodies for shape in self.shapes_of(each)])
+            return GeometrySet([shape for each in bodies for shape in self.contact_shapes_of(each)])
 
         context, together = plant.CreateDefaultContext(), [self.surroundings]
         telescopes = list[tuple[Array, set[BodyIndex]]]()
@@ -202,7 +202,7 @@ class PostureShapes:
                 axis, others = R_WF @ joint.translation_axis(), telescopes
                 telescopes = []
                 for other, bodies in others:
-                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_PARALLEL_AXES:
+                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_TELESCOPE_AXES:
                         joined |= bodies
                     else:
                         telescopes.append((other, bodies))
@@ -211,13 +211,13 @@ class PostureShapes:
         for bodies in together:
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes_of_bodies(bodies)))
 
-    def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
+    def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
-        least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_SAMPLED_POSTURES))
+        least = int(np.ceil(_OVERLAP_BY_DESIGN_POSTURE_SHARE * _NUM_SAMPLED_POSTURES))
         limits = joint_sampling_range(self.arm)
         for left in range(_NUM_SAMPLED_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
-            counts.update(p for p in self._distances_of_bodies() if not self.surroundings & set(p))
+            counts.update(p for p in self._body_pair_distances() if not self.surroundings & set(p))
             if max(counts.values(), default=0) + left <= least:
                 return set()
         return {pair for pair, count in counts.items() if count >= least}
@@ -280,10 +280,10 @@ def _prepare_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) ->
         for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
             is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
-            is_limited = box is not None and max(box.half_width()) < _MAX_SHAPE_SIZE_M
+            is_limited = box is not None and max(box.half_width()) < _MAX_COLLISION_SHAPE_SIZE_M
             here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
             if is_curved:
-                shape = Convex(here.inverse() @ surface_points(inspector, geometry).T, name)
+                shape = Convex(here.inverse() @ hull_points_of(inspector, geometry).T, name)
             if is_limited and (is_curved or not solids):
                 added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
             if solids and (is_curved or not is_limited):
@@ -292,22 +292,22 @@ def _prepare_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) ->
         plant.RegisterCollisionGeometry(*each, ProximityProperties())
 
 
-def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return points (k, 3) on the convex hull of a shape, in its body's frame [m]."""
     shape = inspector.GetShape(geometry)
     if isinstance(shape, (Mesh, Convex)):
         hull = shape.GetConvexHull()
         points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
     elif isinstance(shape, Sphere):
-        points = shape.radius() * _unit_sphere()
+        points = shape.radius() * _unit_sphere_points()
     elif isinstance(shape, Ellipsoid):
-        points = _unit_sphere() * [shape.a(), shape.b(), shape.c()]
+        points = _unit_sphere_points() * [shape.a(), shape.b(), shape.c()]
     elif isinstance(shape, Capsule):
         end = [0.0, 0.0, shape.length() / 2]
-        ball = shape.radius() * _unit_sphere()
+        ball = shape.radius() * _unit_sphere_points()
         points = np.vstack([ball - end, ball + end])
     elif isinstance(shape, Cylinder):
-        rim = _unit_sphere()[_NUM_POLYHEDRON_SIDES : 2 * _NUM_POLYHEDRON_SIDES] * [1.0, 1.0, 0.0]
+        rim = _unit_sphere_points()[_NUM_CIRCLE_POINTS : 2 * _NUM_CIRCLE_POINTS] * [1.0, 1.0, 0.0]
         rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
         end = [0.0, 0.0, shape.length() / 2]
         points = np.vstack([rim - end, rim + end])
@@ -320,12 +320,12 @@ def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Arra
     return (inspector.GetPoseInFrame(geometry) @ points.T).T
 
 
-def _unit_sphere() -> Array:
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_POLYHEDRON_SIDES // 2 + 1)
-    longitude = 2 * np.pi * np.arange(_NUM_POLYHEDRON_SIDES) / _NUM_POLYHEDRON_SIDES
+def _unit_sphere_points() -> Array:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_CIRCLE_POINTS // 2 + 1)
+    longitude = 2 * np.pi * np.arange(_NUM_CIRCLE_POINTS) / _NUM_CIRCLE_POINTS
     rings = [
         np.column_stack(
-            [c * np.cos(longitude), c * np.sin(longitude), np.full(_NUM_POLYHEDRON_SIDES, s)]
+            [c * np.cos(longitude), c * np.sin(longitude), np.full(_NUM_CIRCLE_POINTS, s)]
         )
         for c, s in zip(np.cos(latitude), np.sin(latitude), strict=True)
     ]

@@ -25,10 +25,10 @@ from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
-_MIN_EVENT_HZ = 2000.0
+_MIN_SERVO_EVENT_HZ = 2000.0
 
 
-def samples_per_event(control_hz: float, hand_hz: float) -> int:
+def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
     """Return how many servo samples an event may contain, with events at 2 kHz or more.
 
     Each sample of the haptic device remains an event. Arguments are rates [Hz].
@@ -37,7 +37,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
     whole = round(ratio)
     if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
-    most = max(int(control_hz / _MIN_EVENT_HZ), 1)
+    most = max(int(control_hz / _MIN_SERVO_EVENT_HZ), 1)
     return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
 
 

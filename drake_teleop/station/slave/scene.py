@@ -24,9 +24,9 @@ from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 #: Folders of converted meshes, kept while the process runs.
-_KEPT_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
+_CONVERTED_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
 _RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
+_TOOL_BALL_MESH_EDGE_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
 @settings
@@ -73,7 +73,7 @@ class Scene(Environment):
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
-            _KEPT_MESH_FOLDERS.append(folder)
+            _CONVERTED_MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_BODY_NAMES:
@@ -120,7 +120,7 @@ class Scene(Environment):
             properties = ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(properties):
                 AddCompliantHydroelasticProperties(
-                    _MESH_RESOLUTION_M, self.tool_modulus, properties
+                    _TOOL_BALL_MESH_EDGE_M, self.tool_modulus, properties
                 )
                 scene_graph.AssignRole(
                     plant.get_source_id(), shape, properties, RoleAssign.kReplace

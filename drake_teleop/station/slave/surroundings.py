@@ -38,7 +38,7 @@ from drake_teleop.station.environment.point_contact import (
     FindContactPairs,
 )
 
-_FRAME_TOLERANCE = 1e-12  # rounding of frames
+_IDENTITY_POSE_TOLERANCE = 1e-12  # rounding of frames
 _MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
@@ -122,7 +122,7 @@ def MakeToolContactModel(
             gravity = plant.gravity_field().gravity_vector()[2]
             contact = contact._replace(leaf_parameters=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
-    _check_masses(plant, context, contact)
+    _check_body_masses(plant, context, contact)
     if reason := _reason_for_drake_contact(environment, contact):
         return contact._replace(drake_contact_reason=reason)
     joints, order = contact.joint_table, list[int]()
@@ -155,10 +155,10 @@ def _X_SBody(
 ) -> RigidTransform:
     frame = plant.get_body(index).body_frame()
     X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-    return RigidTransform() if X_SBody.IsNearlyIdentity(_FRAME_TOLERANCE) else X_SBody
+    return RigidTransform() if X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE) else X_SBody
 
 
-def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
+def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
     if not contact.moving_bodies:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))

@@ -23,8 +23,8 @@ from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
-_TOOL_STIFFNESS_N_M, _TOOL_DISSIPATION_S_M, _TOOL_FRICTION = 4e5, 1.0, 0.2
-_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
+_CONTACT_STIFFNESS_N_M, _CONTACT_DISSIPATION_S_M, _TOOL_FRICTION_COEFFICIENT = 4e5, 1.0, 0.2
+_REPLAY_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
 
@@ -102,7 +102,7 @@ class Tool:
                 where=f"{where}.mass",
                 remedy="give the mass, or remove them",
             )
-        if not _spatial_inertia_of(self).IsPhysicallyValid():
+        if not _tool_spatial_inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
                 "the inertia is impossible for a rigid body",
                 where=f"{where}.inertia",
@@ -126,18 +126,18 @@ def AddTool(
     """Add the tool to a plant and weld it to the sensor frame by the joint "sensor_weld"."""
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
-    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _spatial_inertia_of(tool))
+    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _tool_spatial_inertia(tool))
     weld = WeldJoint("sensor_weld", sensor_frame, body.body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     if plant.geometry_source_is_registered():
-        _add_shapes(plant, body, tool)
+        _add_tool_shapes(plant, body, tool)
     return ParsedTool(body, [])
 
 
-def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
+def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
-    friction = CoulombFriction(_TOOL_FRICTION, _TOOL_FRICTION)
-    AddContactMaterial(surface, _TOOL_DISSIPATION_S_M, _TOOL_STIFFNESS_N_M, friction)
+    friction = CoulombFriction(_TOOL_FRICTION_COEFFICIENT, _TOOL_FRICTION_COEFFICIENT)
+    AddContactMaterial(surface, _CONTACT_DISSIPATION_S_M, _CONTACT_STIFFNESS_N_M, friction)
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)
@@ -148,11 +148,11 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
         if (length := float(np.linalg.norm(each.position))) > 0.0:  # a rod from S, without contact
             along = RotationMatrix.MakeFromOneVector(np.array(each.position), 2)
             middle = RigidTransform(along, np.array(each.position) / 2)
-            rod = Cylinder(_ROD_RADIUS_M, length)
+            rod = Cylinder(_REPLAY_ROD_RADIUS_M, length)
             plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _TOOL_COLOUR)
 
 
-def _spatial_inertia_of(tool: Tool) -> SpatialInertia:
+def _tool_spatial_inertia(tool: Tool) -> SpatialInertia:
     if tool.mass == 0.0:
         return SpatialInertia.Zero()
     if not any(tool.inertia):

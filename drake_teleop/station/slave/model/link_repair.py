@@ -7,11 +7,11 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_number
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_INERTIA_ENTRIES = {
+_PLACE_OF_INERTIA_ENTRY = {
     "ixx": (0, 0),
     "ixy": (0, 1),
     "ixz": (0, 2),
@@ -20,10 +20,10 @@ _INERTIA_ENTRIES = {
     "izz": (2, 2),
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
-_ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
-_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
+_INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
+_INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
-_TRIANGLE_INEQUALITY_MARGIN = 1e-9
+_TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
 
 
 def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
@@ -46,10 +46,10 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     text = (mass_element.get("value") or mass_element.text or "").strip()
     mass, inertia = parse_number(text), _inertia_tensor_of(inertial, is_sdf=is_sdf)
     fault = ""
-    if not 0.0 <= mass <= MAX_SI_VALUE:
-        fault = f"mass {text} kg is not between 0 and {MAX_SI_VALUE:g} kg"
-    elif not (np.abs(inertia) <= MAX_SI_VALUE).all():
-        fault = f"an entry of its inertia is no number up to {MAX_SI_VALUE:g} kg m^2"
+    if not 0.0 <= mass <= MAX_MODEL_VALUE_SI:
+        fault = f"mass {text} kg is not between 0 and {MAX_MODEL_VALUE_SI:g} kg"
+    elif not (np.abs(inertia) <= MAX_MODEL_VALUE_SI).all():
+        fault = f"an entry of its inertia is no number up to {MAX_MODEL_VALUE_SI:g} kg m^2"
     no_mass = not fault and mass == 0.0
     if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
@@ -62,7 +62,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
             report.state_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, report)
         link.remove(inertial)
-        _write_inertial(
+        _add_inertial_element(
             link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
         )
     return not at_rest and not inertia.any()
@@ -72,7 +72,7 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
-    for name, (row, column) in _INERTIA_ENTRIES.items():
+    for name, (row, column) in _PLACE_OF_INERTIA_ENTRY.items():
         default = "1" if is_sdf and row == column else "0"
         text = element.get(name) or element.findtext(name) or default
         tensor[row, column] = tensor[column, row] = parse_number(text)
@@ -82,16 +82,19 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> Array:
 def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) -> Array:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _ROUNDING_KG_M2:
+    if (
+        0.0 < change <= _INERTIA_ROUNDING_SHARE
+        or 0.0 < change * np.abs(inertia).max() <= _INERTIA_ROUNDING_KG_M2
+    ):
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "warning: " if change > _SUSPICIOUS_SHARE else ""
+        warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
         report.state_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
 
 
-def _write_inertial(
+def _add_inertial_element(
     link: Element,
     pose: Element | None,
     mass: float,
@@ -102,7 +105,7 @@ def _write_inertial(
     inertial = SubElement(link, "inertial")
     if pose is not None:
         inertial.append(pose)
-    entries = {name: f"{inertia[place]:.17g}" for name, place in _INERTIA_ENTRIES.items()}
+    entries = {name: f"{inertia[place]:.17g}" for name, place in _PLACE_OF_INERTIA_ENTRY.items()}
     if is_sdf:
         SubElement(inertial, "mass").text = f"{mass:.17g}"
         element = SubElement(inertial, "inertia")
@@ -129,6 +132,6 @@ def nearest_possible_inertia(
     if given[0] >= 0.0 and deficit <= 0.0:
         return inertia, 0.0
     moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
-    moments[0] += _TRIANGLE_INEQUALITY_MARGIN * largest
+    moments[0] += _TRIANGLE_INEQUALITY_MARGIN_SHARE * largest
     distance = float(np.abs(moments - given).max()) / largest
     return (axes * moments) @ axes.T, distance

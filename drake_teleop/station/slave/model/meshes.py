@@ -14,14 +14,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import silent_stderr
-from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE, parse_number
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_number
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _COLLISION_MESH_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
-_DIMENSIONS_OF_SHAPE = {
+_NUM_VALUES_OF_SHAPE_SIZES = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -30,9 +30,9 @@ _DIMENSIONS_OF_SHAPE = {
     "mesh": {},
     "plane": {},
 }
-_MIN_MESH_VERTICES = 3  # of a mesh
-_STICK_RADIUS_M = 0.035
-_STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
+_MIN_HULL_VERTICES_OF_MESH = 3  # of a mesh
+_SKELETON_STICK_RADIUS_M = 0.035
+_SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
 def remove_unusable_shapes(
@@ -50,7 +50,7 @@ def remove_unusable_shapes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                fault = _shape_fault(shape) or _convert_mesh(shape, model, files, folder)
+                fault = _shape_fault(shape) or _resolve_mesh_file(shape, model, files, folder)
                 if fault:
                     link.remove(shape)
                     removed.add(fault)
@@ -70,18 +70,18 @@ def remove_unusable_shapes(
 def _shape_fault(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _DIMENSIONS_OF_SHAPE:
+    if inner is None or kind not in _NUM_VALUES_OF_SHAPE_SIZES:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS_OF_SHAPE[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_VALUES_OF_SHAPE_SIZES[kind]
     for name, count in sizes.items():
         values = _numbers_in_text(inner.get(name) or inner.findtext(name))
-        if len(values) != count or not all(0.0 < value <= MAX_SI_VALUE for value in values):
+        if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
             return f"the {name} of a {kind} is no usable size"
     scale = _numbers_in_text(inner.get("scale") or inner.findtext("scale"))
     places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
     texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
     numbers = [value for text in texts for value in _numbers_in_text(text)]
-    valid = all(scale) and all(abs(value) <= MAX_SI_VALUE for value in numbers)
+    valid = all(scale) and all(abs(value) <= MAX_MODEL_VALUE_SI for value in numbers)
     return None if valid else "of an invalid place or scale"
 
 
@@ -89,7 +89,7 @@ def _numbers_in_text(text: str | None) -> list[float]:
     return [parse_number(word) for word in (text or "").split()]
 
 
-def _convert_mesh(
+def _resolve_mesh_file(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
     mesh = shape.find("geometry/mesh")
@@ -99,7 +99,7 @@ def _convert_mesh(
     file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
-    if fault := files.access_fault(file, "meshes"):
+    if fault := files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
@@ -122,7 +122,7 @@ def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file i
     if path.suffix.lower() in (".gltf", ".vtk"):
         try:
             with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_MESH_VERTICES
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_HULL_VERTICES_OF_MESH
         except RuntimeError:
             return False
     try:
@@ -175,7 +175,7 @@ def _add_stick(plant: MultibodyPlant, first: Frame, last: RigidTransform, body: 
     start = first.GetFixedPoseInBodyFrame().translation()
     way = last.translation() - start
     length = float(np.linalg.norm(way))
-    along = way / length if length > _STICK_RADIUS_M else np.array([0.0, 0.0, 1.0])
+    along = way / length if length > _SKELETON_STICK_RADIUS_M else np.array([0.0, 0.0, 1.0])
     pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), start + way / 2)
-    stick = Capsule(_STICK_RADIUS_M, max(length, 1e-3))
-    plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _STICK_COLOUR)
+    stick = Capsule(_SKELETON_STICK_RADIUS_M, max(length, 1e-3))
+    plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _SKELETON_COLOUR)

@@ -12,34 +12,34 @@ from pydrake.math import RigidTransform
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MIN_VECTOR_LENGTH,
+    MIN_DIRECTION_VECTOR_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
 )
 from drake_teleop.station.slave.model.mjcf_masses import (
-    NO_MASS,
+    ZERO_MASS_PROPERTIES,
     MassProperties,
-    combine_properties,
-    fit_primitive,
-    mesh_properties,
-    primitive_properties,
+    combine_mass_properties,
+    fit_shape_to_mesh,
+    mass_properties_of_mesh,
+    mass_properties_of_primitive,
 )
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
-from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
 
 # Elements that generate bodies or joints.
-_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
+_BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
-_NUM_SIZES_OF_SHAPE = {
+_NUM_SIZE_VALUES_OF_SHAPE = {
     "sphere": 1,
     "capsule": 2,
     "cylinder": 2,
     "ellipsoid": 3,
     "box": 3,
 }  # numbers in size
-_ROUND_SHAPES = ("capsule", "cylinder")
+_ROUND_ROD_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
 
 
@@ -102,11 +102,11 @@ class Body:
     def with_descendants(self) -> list[Body]:
         return [self, *(body for child in self.children for body in child.with_descendants())]
 
-    def path_to(self, name: str) -> list[Body]:
+    def bodies_on_path_to(self, name: str) -> list[Body]:
         """Return the bodies from this one to the carried body `name`, or an empty list."""
         if self.name == name:
             return [self]
-        paths = (child.path_to(name) for child in self.children)
+        paths = (child.bodies_on_path_to(name) for child in self.children)
         return next(([self, *path] for path in paths if path), [])
 
 
@@ -179,7 +179,7 @@ class BodyReader:
                 body.sites[child.get("name", "")] = X_BF @ self._mjcf.read_pose(attributes)
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
-            elif child.tag in _GENERATOR_TAGS:
+            elif child.tag in _BODY_GENERATOR_TAGS:
                 body.generator_tags.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
@@ -187,7 +187,7 @@ class BodyReader:
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if np.linalg.norm(axis) < MIN_VECTOR_LENGTH:
+        if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
             self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
@@ -204,20 +204,20 @@ class BodyReader:
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
         X_FG = self._mjcf.read_pose(given)
-        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_SI_VALUE)
-        if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
+        size = given.numbers("size", (0.0, 0.0, 0.0), MAX_MODEL_VALUE_SI)
+        if "fromto" in given and kind in (*_ROUND_ROD_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
-            size = [size[0], half, 0.0] if kind in _ROUND_SHAPES else [size[0], size[0], half]
+            size = [size[0], half, 0.0] if kind in _ROUND_ROD_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
         elif (
-            kind in _NUM_SIZES_OF_SHAPE
+            kind in _NUM_SIZE_VALUES_OF_SHAPE
             and not name
-            and min(size[: _NUM_SIZES_OF_SHAPE[kind]]) <= 0.0
+            and min(size[: _NUM_SIZE_VALUES_OF_SHAPE[kind]]) <= 0.0
         ):
             fault = "shapes need a size above 0"
         if fault:
@@ -226,7 +226,7 @@ class BodyReader:
         if mesh is not None and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
-                X_GM, size = fit_primitive(mesh, kind, by_box=by_box)
+                X_GM, size = fit_shape_to_mesh(mesh, kind, by_box=by_box)
             except ValueError as error:
                 self.lost.setdefault(str(error), []).append((body, given))
                 return
@@ -246,13 +246,13 @@ class BodyReader:
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.read_pose(given))
 
-    def mass_properties(self, body: Body) -> MassProperties:
+    def mass_properties_of_body(self, body: Body) -> MassProperties:
         """Return the body's mass properties from its `inertial` element, or from its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_properties([self._mass_of_geom(geom) for geom in body.geoms])
-        mass, centre, inertia = given or NO_MASS
+            given = combine_mass_properties([self._mass_of_geom(geom) for geom in body.geoms])
+        mass, centre, inertia = given or ZERO_MASS_PROPERTIES
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
             moments, axes = np.linalg.eigh(inertia)
@@ -264,16 +264,16 @@ class BodyReader:
     def _mass_of_geom(self, geom: Geom) -> MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
-            return NO_MASS
+            return ZERO_MASS_PROPERTIES
         try:
             shape = (
-                mesh_properties(geom.mesh)
+                mass_properties_of_mesh(geom.mesh)
                 if geom.mesh
-                else primitive_properties(geom.kind, geom.size)
+                else mass_properties_of_primitive(geom.kind, geom.size)
             )
         except ValueError as error:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
-            return NO_MASS
+            return ZERO_MASS_PROPERTIES
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)

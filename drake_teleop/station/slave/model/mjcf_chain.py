@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
-_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
-_LOOP_TAGS = ("connect", "weld", "distance")
-_UNBOUNDED_DYNAMICS_TYPES = (
+_MAX_SUGGESTED_FRAMES = 12  # names of frames in an error: the most similar ones
+_LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
+_UNBOUNDED_ACTUATOR_DYNAMICS = (
     "integrator",
     "muscle",
     "user",
@@ -34,7 +34,7 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             for top, *_ in tops
             for name in _names_of_elements(top, tag)
         }
-        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_LISTED_NAMES, cutoff=0.0)
+        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_SUGGESTED_FRAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
         what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
         for fault in (what, *reader.meshes.inaccessible):
@@ -61,7 +61,7 @@ def read_whole_world(reader: BodyReader) -> Body:
     return _split_into_one_joint_bodies(reader.read_world())
 
 
-def hold_joints(
+def weld_joints_outside_chain(
     world: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
 ) -> list[tuple[Body, Joint]]:
     """Weld free bodies and joints outside the chain; return the moving joints with their bodies.
@@ -91,7 +91,7 @@ def hold_joints(
     return moving
 
 
-def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
+def check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
     """Report couplings between `joints` as faults; report other couplings as left out."""
     report, moving = mjcf.report, {joint.name for joint in joints}
     carriers = _moving_body_of_each_body(arm, {id(body) for body in chain})
@@ -102,7 +102,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOP_TAGS and _closes_loop(given, carriers):
+        elif element.tag in _LOOP_EQUALITY_TAGS and _equality_closes_loop(given, carriers):
             report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
@@ -118,7 +118,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
             report.state_assumption("no dry friction, which the model has, of", joint.name)
 
 
-def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
+def report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
     """Report all couplings and springs, which Drake does not read from MJCF."""
     for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
@@ -176,16 +176,16 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_measured: bool) ->
 
 def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
 
-    def collect_carriers(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
+    def pair_with_moving_body(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
         carrier = body.name if id(body) in chain and body.joints else carrier
         yield body.name, carrier
         for child in body.children:
-            yield from collect_carriers(child, carrier)
+            yield from pair_with_moving_body(child, carrier)
 
-    return dict(collect_carriers(arm, "world"))
+    return dict(pair_with_moving_body(arm, "world"))
 
 
-def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
+def _equality_closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -211,7 +211,7 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
         own = joint.attributes.read_range(
             "actuatorfrcrange", "actuatorfrclimited", automatic=mjcf.autolimits
         )
-        limit = min(by_joint.get(joint.name, float("inf")), _effort_in_both_directions(own))
+        limit = min(by_joint.get(joint.name, float("inf")), _effort_limit_in_both_directions(own))
         if 0.0 < limit < float("inf"):
             limits[joint.name] = limit
     return limits
@@ -219,16 +219,16 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
 
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
-    force = _effort_in_both_directions(
+    force = _effort_limit_in_both_directions(
         given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
     )
-    if (gain := _force_per_control(given, tag)) > 0.0:
+    if (gain := _effort_per_control_unit(given, tag)) > 0.0:
         control = given.read_range("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
-        force = min(force, gain * _effort_in_both_directions(control))
+        force = min(force, gain * _effort_limit_in_both_directions(control))
     return gear * force
 
 
-def _force_per_control(given: Attributes, tag: str) -> float:
+def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag == "motor":
         return 1.0
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
@@ -237,13 +237,13 @@ def _force_per_control(given: Attributes, tag: str) -> float:
     if (
         biased
         or given.get("gaintype", "fixed") != "fixed"
-        or given.get("dyntype") in _UNBOUNDED_DYNAMICS_TYPES
+        or given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
     ):
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
 
 
-def _effort_in_both_directions(limits: tuple[float, float] | None) -> float:
+def _effort_limit_in_both_directions(limits: tuple[float, float] | None) -> float:
     if limits is None:
         return float("inf")
     smaller, larger = sorted(map(abs, limits))

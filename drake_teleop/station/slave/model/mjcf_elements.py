@@ -13,16 +13,16 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model.model_numbers import MAX_SI_VALUE
+from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_MAX_NESTING_DEPTH = 150  # largest depth of nested elements
-MIN_VECTOR_LENGTH = 1e-9
+_MAX_ELEMENT_NESTING_DEPTH = 150  # largest depth of nested elements
+MIN_DIRECTION_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
-_COMPLETED_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+_SHORT_LIST_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
 _ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
 _ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
@@ -56,9 +56,9 @@ class Attributes(dict[str, str]):
         count, values = len(default), self.numbers(name, default)
         if (
             len(self.get(name, "").split()) not in (0, count)
-            or max(map(abs, values)) > MAX_SI_VALUE
+            or max(map(abs, values)) > MAX_MODEL_VALUE_SI
         ):
-            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_SI_VALUE:g}"
+            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_MODEL_VALUE_SI:g}"
             self._report.add_fault(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)
@@ -151,7 +151,7 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if np.linalg.norm(z) < MIN_VECTOR_LENGTH:
+            if np.linalg.norm(z) < MIN_DIRECTION_VECTOR_LENGTH:
                 self.report.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
@@ -161,8 +161,8 @@ class Mjcf:
     def _insert_includes(
         self, element: Element, path: Path, included: set[Path], depth: int
     ) -> None:
-        if depth > _MAX_NESTING_DEPTH:
-            what = f"its elements are nested more than {_MAX_NESTING_DEPTH} deep"
+        if depth > _MAX_ELEMENT_NESTING_DEPTH:
+            what = f"its elements are nested more than {_MAX_ELEMENT_NESTING_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))
         content = list[Element]()
         for child in element:
@@ -204,7 +204,7 @@ def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, 
     merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _COMPLETED_ATTRIBUTES else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _SHORT_LIST_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 

@@ -29,13 +29,13 @@ class MassProperties(NamedTuple):
         return MassProperties(mass, self.centre, self.inertia * ratio)
 
 
-NO_MASS = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
+ZERO_MASS_PROPERTIES = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
-def combine_properties(parts: list[MassProperties]) -> MassProperties:
+def combine_mass_properties(parts: list[MassProperties]) -> MassProperties:
     mass = sum(part.mass for part in parts)
     if mass <= 0.0:
-        return NO_MASS
+        return ZERO_MASS_PROPERTIES
     centre = sum((part.mass * part.centre for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
@@ -44,7 +44,7 @@ def combine_properties(parts: list[MassProperties]) -> MassProperties:
     return MassProperties(mass, centre, inertia)
 
 
-def primitive_properties(kind: str, size: list[float]) -> MassProperties:
+def mass_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
     """Return the mass properties of a shape of density 1 in its own axes."""
     a, b, c = size
     if kind == "box":
@@ -61,11 +61,11 @@ def primitive_properties(kind: str, size: list[float]) -> MassProperties:
         along = middle * a**2 / 2 + ends * 0.4 * a**2
         volume, moments = middle + ends, np.array([across, across, along]) / (middle + ends)
     else:  # plane, hfield
-        return NO_MASS
+        return ZERO_MASS_PROPERTIES
     return MassProperties(volume, np.zeros(3), np.diag(volume * moments))
 
 
-def mesh_properties(mesh: Mesh) -> MassProperties:
+def mass_properties_of_mesh(mesh: Mesh) -> MassProperties:
     """Return the mass properties of a mesh of density 1, by MuJoCo's rule in `mesh.inertia`.
 
     The rule "legacy" counts all tetrahedra between triangles and centre as positive.
@@ -78,23 +78,23 @@ def mesh_properties(mesh: Mesh) -> MassProperties:
     area = np.linalg.norm(normal, axis=1) / 2
     centre = area @ corners.mean(axis=1) / max(float(area.sum()), 1e-300)
     if mesh.inertia == "shell":
-        return _properties_of_simplices(corners - centre, area, centre)
+        return _mass_properties_of_simplices(corners - centre, area, centre)
     volume = _tetrahedron_volumes(corners - centre, mesh.inertia)
     if volume.sum() <= 0.0:
-        return NO_MASS
+        return ZERO_MASS_PROPERTIES
     centre = centre + volume @ (corners - centre).sum(axis=1) / 4 / volume.sum()
     # As in MuJoCo, the volumes are computed again about the centre of mass.
-    return _properties_of_simplices(
+    return _mass_properties_of_simplices(
         corners - centre, _tetrahedron_volumes(corners - centre, mesh.inertia), centre, 4
     )
 
 
-def fit_primitive(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
+def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
     """Return pose and size of the primitive, such as a box, that MuJoCo fits to a mesh.
 
     Its size follows from the mesh's inertia, or with `by_box` from its bounding box (`fitaabb`).
     """
-    mass, centre, inertia = mesh_properties(mesh)
+    mass, centre, inertia = mass_properties_of_mesh(mesh)
     moments, axes = np.linalg.eigh(inertia)
     moments, axes = moments[::-1], axes[:, ::-1]  # the longest axis becomes z
     axes[:, 2] *= np.linalg.det(axes)
@@ -116,7 +116,7 @@ def fit_primitive(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransfor
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(axes), centre), size
 
 
-def _properties_of_simplices(
+def _mass_properties_of_simplices(
     corners: Array, weight: Array, centre: Array, count: int = 3
 ) -> MassProperties:
     """Return mass properties of m triangles (count 3) or tetrahedra with the centre (count 4)."""

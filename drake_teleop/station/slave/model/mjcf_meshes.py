@@ -11,14 +11,14 @@ import numpy as np
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.triangles import (
     Triangles,
-    check_triangles,
+    check_triangle_vertices,
     convex_hull,
     obj_text,
     read_triangles,
 )
 
-_NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
-_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
+_MESHES_NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
+_MESHES_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 
 
 class Mesh:
@@ -46,7 +46,7 @@ class Mesh:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
             else:
-                vertices, faces = check_triangles(_read_inline_mesh(self._attributes))
+                vertices, faces = check_triangle_vertices(_read_inline_mesh(self._attributes))
             moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
             if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
                 faces = faces[:, ::-1]
@@ -87,19 +87,19 @@ class MeshLibrary:
 
     def find(self, name: str) -> Mesh | str:
         """Return a mesh, or a text about its fault."""
-        mesh = self._meshes.get(name, _NOT_FOUND_FAULT)
+        mesh = self._meshes.get(name, _MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:
                 mesh.triangles()
             except ValueError:
                 suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
-                self._meshes[name] = mesh = f"{suffix}{_UNREADABLE_FAULT}"
+                self._meshes[name] = mesh = f"{suffix}{_MESHES_UNREADABLE_FAULT}"
         return mesh
 
     def _find_mesh_file(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         name = attributes.get("file", "")
         if not name:
-            return None, "" if "vertex" in attributes else _UNREADABLE_FAULT
+            return None, "" if "vertex" in attributes else _MESHES_UNREADABLE_FAULT
         compiler = self._mjcf.compiler
         if compiler.get("strippath") == "true":
             name = re.split(r"[/\\]", name)[-1]
@@ -107,8 +107,8 @@ class MeshLibrary:
         folder = compiler.get(own, compiler.get("assetdir", ""))
         file = self._mjcf.find_file(element, name, folder)
         if file is None:
-            return None, _NOT_FOUND_FAULT
-        if fault := self._mjcf.files.access_fault(file, f"{element.tag} files"):
+            return None, _MESHES_NOT_FOUND_FAULT
+        if fault := self._mjcf.files.file_access_fault(file, f"{element.tag} files"):
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

@@ -18,15 +18,15 @@ from drake_teleop.station.slave.model.link_repair import (
 )
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, takes_part_in_contacts
 from drake_teleop.station.slave.model.mjcf_chain import (
-    check_couplings,
+    check_joint_couplings,
     effort_limits,
-    hold_joints,
     read_whole_world,
     read_world_with_arm,
-    report_couplings,
+    report_lost_couplings,
+    weld_joints_outside_chain,
 )
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
+from drake_teleop.station.slave.model.mjcf_masses import ZERO_MASS_PROPERTIES
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
@@ -51,19 +51,19 @@ def repair_mjcf(
         gravity = Attributes(option.attrib, "option", report).vector("gravity", _DRAKE_GRAVITY_M_S2)
         if np.abs(np.subtract(gravity, _DRAKE_GRAVITY_M_S2)).max() > _GRAVITY_TOLERANCE_M_S2:
             report.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
-    is_complete = purpose.is_scene or purpose.in_directives
+    is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
         world = read_whole_world(reader)
         chain = world.with_descendants() if is_complete else []
     else:
         world = read_world_with_arm(mjcf, reader, purpose.sensor_name)
-        chain = world.path_to(purpose.sensor_name)
+        chain = world.bodies_on_path_to(purpose.sensor_name)
     if is_complete:
         moving = [(body, joint) for body in chain for joint in body.joints]
-        report_couplings([joint for _, joint in moving], mjcf)
+        report_lost_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = hold_joints(world, chain, purpose.held_positions, mjcf)
-        check_couplings(world, chain, [joint for _, joint in moving], mjcf)
+        moving = weld_joints_outside_chain(world, chain, purpose.held_positions, mjcf)
+        check_joint_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
         report.state_assumption(
@@ -71,7 +71,7 @@ def repair_mjcf(
         )
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
     _check_names_and_generators(world, report)
-    _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
+    _set_body_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _report_lost_shapes(reader, report)
     report.raise_faults(path)
@@ -95,20 +95,20 @@ def _check_names_and_generators(world: Body, report: RepairReport) -> None:
             report.add_fault(f"several {kind} are named {join_names(twice)}")
 
 
-def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
+def _set_body_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
     total = mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _sum_of_masses_in_file(mjcf) if total > 0.0 else 1.0
 
-    def set_masses_below(body: Body, is_moved: bool) -> None:
+    def set_masses_of_subtree(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
         _set_mass_of_body(body, reader, factor, mjcf.report, is_moved=is_moved)
-        if id(body) in moving and body.inertial is NO_MASS and not body.is_auxiliary:
+        if id(body) in moving and body.inertial is ZERO_MASS_PROPERTIES and not body.is_auxiliary:
             mjcf.report.state_assumption("no inertia of", body.name)
         for child in body.children:
-            set_masses_below(child, is_moved)
+            set_masses_of_subtree(child, is_moved)
 
     for body in world.children:
-        set_masses_below(body, is_moved=False)
+        set_masses_of_subtree(body, is_moved=False)
 
 
 def _set_mass_of_body(
@@ -116,11 +116,11 @@ def _set_mass_of_body(
 ) -> None:
     if body.is_auxiliary:
         return
-    properties = reader.mass_properties(body)
+    properties = reader.mass_properties_of_body(body)
     if properties.mass <= 0.0:
         if is_moved and properties.inertia.any():
             report.state_repair("an inertia without a mass left out of", body.name)
-        body.inertial = NO_MASS
+        body.inertial = ZERO_MASS_PROPERTIES
         return
     properties = properties.with_mass(factor * properties.mass)
     inertia = (
@@ -134,7 +134,7 @@ def _set_mass_of_body(
 def _sum_of_masses_in_file(mjcf: Mjcf) -> float:
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
     bodies = reader.read_world().with_descendants()[1:]
-    mass = sum(reader.mass_properties(body).mass for body in bodies)
+    mass = sum(reader.mass_properties_of_body(body).mass for body in bodies)
     return mass if mass > 0.0 else np.inf
 
 

@@ -38,7 +38,7 @@ class MjcfText:
     def write(self, world: Body, moving: list[Joint]) -> str:
         """Return the MJCF text of a world; the joints `moving` get actuators."""
         top = SubElement(self._root, "worldbody")
-        self._write_content(top, world)
+        self._write_body_content(top, world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
         for each in self._mjcf.elements_in("contact"):
@@ -50,7 +50,7 @@ class MjcfText:
             SubElement(actuators, "motor", name=joint.name, joint=joint.name)
         return tostring(self._root, encoding="unicode")
 
-    def _write_content(self, element: Element, body: Body) -> None:
+    def _write_body_content(self, element: Element, body: Body) -> None:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.plant_has_shapes else ():
@@ -65,7 +65,7 @@ class MjcfText:
                 SubElement(inner, "inertial", {"pos": _format_numbers(centre), **values})
             if self._purpose.is_tool and body.name == "world":
                 SubElement(inner, "freejoint")
-            self._write_content(inner, child)
+            self._write_body_content(inner, child)
 
     def _write_joint(self, element: Element, joint: Joint) -> None:
         if joint.kind == "free":
@@ -97,21 +97,21 @@ class MjcfText:
             shape = (
                 {"size": _format_numbers(geom.size)}
                 if geom.mesh is None
-                else self._mesh_asset(geom.mesh)
+                else self._add_mesh_asset(geom.mesh)
             )
             SubElement(element, "geom", {**values, **shape})
             return
         if geom.is_visible:
-            SubElement(element, "geom", {**values, **seen, **self._mesh_asset(geom.mesh)})
+            SubElement(element, "geom", {**values, **seen, **self._add_mesh_asset(geom.mesh)})
         try:
-            hull = self._mesh_asset(geom.mesh, hull=True)
+            hull = self._add_mesh_asset(geom.mesh, hull=True)
         except ValueError as error:
             fault = f"{error}; shapes are missing of"
             self._mjcf.report.state_repair(fault, body.name)
         else:
             SubElement(element, "geom", {**values, **felt, **hull})
 
-    def _mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
+    def _add_mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull
         if key not in self._meshes:
             file = mesh.write_hull(self._folder) if hull else mesh.write_obj(self._folder)

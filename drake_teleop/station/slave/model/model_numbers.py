@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-MAX_SI_VALUE = 1e6  # largest length, mass or inertia, SI units; limits may be larger
+MAX_MODEL_VALUE_SI = 1e6  # largest length, mass or inertia, SI units; limits may be larger
 _NUMBER_LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")
 _NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
@@ -34,7 +34,7 @@ def replace_commas_by_blanks(root: Element) -> None:
             element.text = (element.text or "").replace(",", " ")
 
 
-def check_quantities(element: Element, where: str, report: RepairReport) -> None:
+def check_lengths_and_inertias(element: Element, where: str, report: RepairReport) -> None:
     """Report lengths, inertias or rotor inertias in an element that are too large or no numbers."""
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
@@ -47,15 +47,15 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
             value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
-            if not abs(value) <= MAX_SI_VALUE:
+            if not abs(value) <= MAX_MODEL_VALUE_SI:
                 report.add_fault(
-                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_SI_VALUE:g}"
+                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_MODEL_VALUE_SI:g}"
                 )
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
                 report.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")
 
 
-def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
+def repair_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
     """Correct limits, friction and damping of a joint; report changes and faults."""
     name = joint.get("name", "")
     where = f"joint {name}"
@@ -65,7 +65,7 @@ def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_cha
             report.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
             report.add_fault(f"{where}: its {end} link {link!r} does not exist")
-    check_quantities(joint, where, report)
+    check_lengths_and_inertias(joint, where, report)
     if joint.get("type") == "fixed":
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)

@@ -24,7 +24,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 
 # Limits for all files together (repeated includes count again), and bytes of one text file.
-_MAX_FILES, _MAX_TOTAL_BYTES, _MAX_TEXT_BYTES = 2000, 500_000_000, 50_000_000
+_MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50_000_000
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _BINARY_SUFFIXES = (
@@ -40,10 +40,10 @@ _BINARY_SUFFIXES = (
     ".dae",
 )
 _PACKAGE_FILE_NAME = "package.xml"
-_FILE_ATTRIBUTE_PATTERN = re.compile(
+_FILE_ATTRIBUTE_NAME_PATTERN = re.compile(
     r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z"
 )
-_FILE_ELEMENT_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
+_FILE_ELEMENT_TAG_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
 _FOLDER_ATTRIBUTES = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
 _MTL_REFERENCE_PATTERN = re.compile(
     rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.*)$", re.M
@@ -73,7 +73,7 @@ class ModelFiles:
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
                 if folder.resolve() == folder:  # neither a link nor ".."
                     self.packages.setdefault(name, folder)
-        own += filter(_is_installed_package, around)
+        own += filter(_is_installed_python_package, around)
         self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
@@ -99,27 +99,27 @@ class ModelFiles:
             path = None if base is None else base / match[2]
         else:
             path = (folder or self._folder) / address.removeprefix("file://")
-        return next(iter(_existing_paths(path)), None)
+        return next(iter(_existing_forms_of_path(path)), None)
 
-    def may_read(self, path: Path) -> bool:
+    def may_read_file(self, path: Path) -> bool:
         """Return whether a file is in the model's folder or a package, after resolving links."""
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
-    def access_fault(self, path: Path, kind: str) -> str:
+    def file_access_fault(self, path: Path, kind: str) -> str:
         """Return the reason why a file of `kind`, such as meshes, must not be read, or nothing."""
-        if not self.may_read(path):
+        if not self.may_read_file(path):
             return (
                 f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
                 " (name their folder: --package-path, slave.package_paths)"
             )
         try:
-            self.check_file(path)
+            self.check_referenced_files(path)
         except DrakeTeleopError as error:
             return str(error)
         return ""
 
-    def check_file(self, path: Path) -> None:
+    def check_referenced_files(self, path: Path) -> None:
         """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
         Meshes of the model's own links are not checked.
@@ -128,13 +128,13 @@ class ModelFiles:
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self._sizes.clear()
-            files, size = self._count_files_and_bytes(path, ())
+            files, size = self._count_with_references(path, ())
         self._total = self._total[0] + files, self._total[1] + size
         _check_num_files_and_size(*self._total, self._model)
 
-    def _count_files_and_bytes(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
+    def _count_with_references(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
-        if not self.may_read(real):
+        if not self.may_read_file(real):
             raise DrakeTeleopError(
                 f"references {real}, which is outside the model's folder and its packages",
                 where=where,
@@ -155,7 +155,7 @@ class ModelFiles:
             files, size = 1, real.stat().st_size
             _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
-                more = self._count_files_and_bytes(named, (*including, real))
+                more = self._count_with_references(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_num_files_and_size(files, size, path)
             self._sizes[real] = files, size
@@ -172,7 +172,7 @@ class ModelFiles:
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
-                found = {file for each in named for file in _existing_paths(each)}
+                found = {file for each in named for file in _existing_forms_of_path(each)}
                 yield from (each for each in found if each != path.parent)
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
@@ -204,7 +204,7 @@ class ModelFiles:
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
 
-def _is_installed_package(folder: Path) -> bool:
+def _is_installed_python_package(folder: Path) -> bool:
     return (
         os.path.isfile(folder / "__init__.py")
         and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
@@ -212,7 +212,7 @@ def _is_installed_package(folder: Path) -> bool:
     )
 
 
-def _existing_paths(path: Path | None) -> list[Path]:
+def _existing_forms_of_path(path: Path | None) -> list[Path]:
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]
@@ -222,9 +222,9 @@ def _existing_paths(path: Path | None) -> list[Path]:
 
 def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     is_text = files == 1 and path.suffix.lower() not in _BINARY_SUFFIXES
-    most = _MAX_TEXT_BYTES if is_text else _MAX_TOTAL_BYTES
-    if files > _MAX_FILES or size > most:
-        what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
+    most = _MAX_TEXT_FILE_BYTES if is_text else _MAX_MODEL_BYTES
+    if files > _MAX_MODEL_FILES or size > most:
+        what = f"{_MAX_MODEL_FILES} files" if files > _MAX_MODEL_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(
             f"exceeds the limit of {what}", where=str(path), remedy="remove or simplify parts"
         )
@@ -239,10 +239,10 @@ def read_xml(path: Path) -> Element:
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
 
-    def reject_entity(name: str | None, *_: object) -> NoReturn:
+    def reject_undefined_entity(name: str | None, *_: object) -> NoReturn:
         raise ValueError(f"the entity {name} is not defined in this XML file")
 
-    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_entity
+    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_undefined_entity
     try:
         parser.Parse(path.read_bytes().lstrip(), True)
         return builder.close()
@@ -257,9 +257,9 @@ def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
             continue
         if element.tag != "mesh" or meshes:
             yield from (
-                x for name, x in element.items() if _FILE_ATTRIBUTE_PATTERN.match(name) and x
+                x for name, x in element.items() if _FILE_ATTRIBUTE_NAME_PATTERN.match(name) and x
             )
-            texts = (e.text for e in element if _FILE_ELEMENT_PATTERN.match(e.tag))
+            texts = (e.text for e in element if _FILE_ELEMENT_TAG_PATTERN.match(e.tag))
             yield from (text.strip() for text in texts if text and text.strip())
 
 
@@ -276,7 +276,7 @@ def addresses_in_directives(data: Any) -> Iterator[str]:
 def _addresses_in_gltf(path: Path) -> list[str]:
     found: list[str] = []
 
-    def keep_addresses(fields: list[tuple[str, Any]]) -> None:
+    def collect_uris(fields: list[tuple[str, Any]]) -> None:
         for name, value in fields:  # includes duplicate names
             if name == "uri" and isinstance(value, str) and not value.startswith("data:"):
                 found.extend({value, unquote(value)})
@@ -285,7 +285,7 @@ def _addresses_in_gltf(path: Path) -> list[str]:
     if path.suffix.lower() == ".glb":
         data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
     try:
-        json.loads(data, object_pairs_hook=keep_addresses)
+        json.loads(data, object_pairs_hook=collect_uris)
     except (ValueError, RecursionError) as error:
         raise DrakeTeleopError(
             f"is not a glTF file ({error})", where=str(path), remedy="export it again"

@@ -9,8 +9,8 @@ from drake_teleop.station.slave.model.repair_report import RepairReport
 
 WORLD_NAME = "world"  # name in URDF and SDF
 JOINT_TAGS = ("joint", "drake:joint")
-_LOOP_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
-_NUM_CONSTRAINT_ENDS = 2  # names of bodies or frames in such a constraint
+_CONSTRAINT_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
+_NUM_NAMES_IN_LOOP_CONSTRAINT = 2  # names of bodies or frames in such a constraint
 _FREE_BASE_JOINT_TYPES = ("floating", "planar")
 
 
@@ -70,12 +70,12 @@ def reduce_to_chain(
     in_chain = set(map(id, chain))
     for joint in list_joints(scope):
         if id(joint) not in in_chain and joint.get("name") not in hold:
-            fix_joint(joint, report)
+            make_joint_fixed(joint, report)
     _remove_loops(scope, num_joints_to_link, report)
     return ModelTree(chain, num_joints_to_link)
 
 
-def fix_joint(joint: Element, report: RepairReport) -> None:
+def make_joint_fixed(joint: Element, report: RepairReport) -> None:
     """Change a moving joint to a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
@@ -157,11 +157,11 @@ def _remove_unconnected_links(
 
 
 def _remove_loops(scope: Element, num_joints_to_link: dict[str, int], report: RepairReport) -> None:
-    for element in [child for child in scope if child.tag in _LOOP_TAGS]:
+    for element in [child for child in scope if child.tag in _CONSTRAINT_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
-        if len(names) < _NUM_CONSTRAINT_ENDS or len(groups) > 1:
+        if len(names) < _NUM_NAMES_IN_LOOP_CONSTRAINT or len(groups) > 1:
             report.add_fault(
                 f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
             )

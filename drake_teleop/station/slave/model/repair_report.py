@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
 
-_MAX_LISTED_NAMES = 12  # names in one statement
+_MAX_JOINED_NAMES = 12  # names in one statement
 
 
 class RepairedModel(NamedTuple):
@@ -81,5 +81,5 @@ class RepairReport:
 def join_names(names: Iterable[str]) -> str:
     """Return a list of names as text; of many only the first twelve, and how many more."""
     each = list(names)
-    more = [f"and {len(each) - _MAX_LISTED_NAMES} more"] if len(each) > _MAX_LISTED_NAMES else []
-    return ", ".join(each[:_MAX_LISTED_NAMES] + more)
+    more = [f"and {len(each) - _MAX_JOINED_NAMES} more"] if len(each) > _MAX_JOINED_NAMES else []
+    return ", ".join(each[:_MAX_JOINED_NAMES] + more)

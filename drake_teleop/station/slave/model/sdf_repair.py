@@ -17,9 +17,9 @@ from drake_teleop.station.slave.model.urdf_repair import (
 )
 
 _MODEL_CONFIG_NAME, _URDF_SUFFIX, _SDF_SUFFIX = "model.config", ".urdf", ".sdf"
-_INCLUDE_URI_PATH = ".//include/uri"
+_INCLUDE_URI_XPATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
-_READABLE_CHILD_TAGS = {
+_CHILD_TAGS_READ_BY_DRAKE = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
     "link": {"pose", "inertial", "collision", "visual"},
     "collision": {"pose", "geometry", "surface"},
@@ -35,7 +35,7 @@ def repair_sdf(
     if not purpose.is_scene:
         _keep_model_with_sensor(root, file, files, purpose.sensor_name, report)
         for element in list(root.iter()):
-            allowed = _READABLE_CHILD_TAGS.get(element.tag)
+            allowed = _CHILD_TAGS_READ_BY_DRAKE.get(element.tag)
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
@@ -44,8 +44,8 @@ def repair_sdf(
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
     inner = [
-        _repair_included(uri, file, files, purpose, folder)
-        for uri in root.iterfind(_INCLUDE_URI_PATH)
+        _repair_included_file(uri, file, files, purpose, folder)
+        for uri in root.iterfind(_INCLUDE_URI_XPATH)
     ]
     own = convert_meshes_and_write_text(
         root, file, files, report, folder if purpose.plant_has_shapes else None
@@ -60,12 +60,12 @@ def repair_sdf(
     return own
 
 
-def _repair_included(
+def _repair_included_file(
     uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
     """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
-    included = _included_file(address, file, files)
+    included = _find_included_model_file(address, file, files)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
         raise DrakeTeleopError(
             f"includes {address!r}, which does not exist",
@@ -77,7 +77,7 @@ def _repair_included(
     repair = {_URDF_SUFFIX: repair_urdf, _SDF_SUFFIX: repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
         return None
-    part = purpose._replace(in_directives=True)
+    part = purpose._replace(is_in_directives=True)
     repaired = repair(read_xml(included), included, files, part, folder)
     target = folder / f"{len(list(folder.iterdir()))}_{included.name}"
     target.write_text(repaired.text, encoding="utf-8")
@@ -85,7 +85,7 @@ def _repair_included(
     return repaired
 
 
-def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
+def _find_included_model_file(address: str, file: Path, files: ModelFiles) -> Path | None:
     found = files.find_file(address, file.resolve().parent) or files.find_file(address)
     if found is not None and (found / _MODEL_CONFIG_NAME).is_file():
         named = read_xml(found / _MODEL_CONFIG_NAME).findall("sdf")
@@ -103,7 +103,7 @@ def _keep_model_with_sensor(
     ]
     if not worlds and len(models) <= 1:
         return
-    with_sensor = [each for each in models if _has_frame(each, file, files, sensor)]
+    with_sensor = [each for each in models if _has_sensor_frame(each, file, files, sensor)]
     if len(with_sensor) != 1:
         return  # Drake or the search for the frame reports it
     (kept,) = with_sensor
@@ -120,11 +120,11 @@ def _keep_model_with_sensor(
             report.state_repair("models beside the arm left out:", name)
 
 
-def _has_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bool:
+def _has_sensor_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bool:
     if model.tag == "model":
         inner = [each for each in model.iter() if each.tag == "model"]
         return any(link_of_frame(scope, sensor) for scope in inner)
-    included = _included_file((model.findtext("uri") or "").strip(), file, files)
+    included = _find_included_model_file((model.findtext("uri") or "").strip(), file, files)
     if included is None or included.suffix.lower() not in (_URDF_SUFFIX, _SDF_SUFFIX):
         return False
     scopes = [each for each in read_xml(included).iter() if each.tag in ("robot", "model")]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 
 # Triangle of a binary STL file.
-_STL_TRIANGLE_TYPE = np.dtype(
+_STL_TRIANGLE_DTYPE = np.dtype(
     [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
 )
 
@@ -29,12 +29,12 @@ def read_triangles(file: Path) -> Triangles:
     """Return the triangles of an STL, OBJ or MSH file, or raise ValueError."""
     read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
     try:
-        return check_triangles(read[file.suffix.lower()](file.read_bytes()))
+        return check_triangle_vertices(read[file.suffix.lower()](file.read_bytes()))
     except (KeyError, IndexError, OSError) as error:  # another kind, or too short
         raise ValueError(str(error)) from None
 
 
-def check_triangles(triangles: Triangles) -> Triangles:
+def check_triangle_vertices(triangles: Triangles) -> Triangles:
     """Return `triangles`; raise ValueError unless all their vertices exist and are finite."""
     vertices, faces = triangles
     if not faces.size:
@@ -63,10 +63,10 @@ def convex_hull(vertices: Array) -> Triangles:
     faces = hull.simplices.astype(np.intp)
     inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
     faces[inwards] = faces[inwards, ::-1]
-    return _merge_vertices(vertices[faces])
+    return _merge_equal_vertices(vertices[faces])
 
 
-def _merge_vertices(corners: Array) -> Triangles:
+def _merge_equal_vertices(corners: Array) -> Triangles:
     points = corners.reshape(-1, 3).astype(float)
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)
@@ -78,10 +78,10 @@ def _merge_vertices(corners: Array) -> Triangles:
 
 def _read_stl(data: bytes) -> Triangles:
     count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + count * _STL_TRIANGLE_TYPE.itemsize:
-        return _merge_vertices(np.frombuffer(data, _STL_TRIANGLE_TYPE, count, 84)["corners"])
+    if len(data) == 84 + count * _STL_TRIANGLE_DTYPE.itemsize:
+        return _merge_equal_vertices(np.frombuffer(data, _STL_TRIANGLE_DTYPE, count, 84)["corners"])
     lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
-    return _merge_vertices(np.array(lines, dtype=float).reshape(-1, 3))
+    return _merge_equal_vertices(np.array(lines, dtype=float).reshape(-1, 3))
 
 
 def _read_obj(data: bytes) -> Triangles:

@@ -14,25 +14,25 @@ from xml.etree.ElementTree import Element, SubElement
 from drake_teleop.station.slave.model.link_repair import repair_inertia
 from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model.model_numbers import (
-    check_joint,
-    check_quantities,
+    check_lengths_and_inertias,
     parse_number,
+    repair_joint,
     replace_commas_by_blanks,
 )
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_tree import (
     WORLD_NAME,
     ModelTree,
-    fix_joint,
     joint_end,
     link_of_frame,
     list_joints,
+    make_joint_fixed,
     reduce_to_chain,
 )
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
 
-_READABLE_URDF_TAGS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
-_READABLE_URDF_TAGS |= {"drake:collision_filter_group"}
+_URDF_TAGS_READ_BY_DRAKE = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
+_URDF_TAGS_READ_BY_DRAKE |= {"drake:collision_filter_group"}
 _NUM_RGBA_VALUES = 4  # red, green, blue, opacity
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
@@ -45,7 +45,7 @@ class ModelPurpose(NamedTuple):
         held_positions: angles or positions [rad, m] of joints that do not move.
         is_tool: whether the model is a tool, whose joints are all fixed.
         is_scene: whether the model is surroundings: all its shapes must be readable.
-        in_directives: whether model directives add the model, so that every link is kept.
+        is_in_directives: whether model directives add the model, so that every link is kept.
         plant_has_shapes: whether the plant has shapes.
     """
 
@@ -53,7 +53,7 @@ class ModelPurpose(NamedTuple):
     held_positions: dict[str, float] = {}  # noqa: RUF012  (never changed)
     is_tool: bool = False
     is_scene: bool = False
-    in_directives: bool = False
+    is_in_directives: bool = False
     plant_has_shapes: bool = True
 
 
@@ -64,7 +64,7 @@ def repair_urdf(
     report = RepairReport(strict=purpose.is_scene)
     root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
-        for child in [child for child in root if child.tag not in _READABLE_URDF_TAGS]:
+        for child in [child for child in root if child.tag not in _URDF_TAGS_READ_BY_DRAKE]:
             if not child.tag.endswith(("_constraint", "_bushing_rpy")):
                 root.remove(child)
         _keep_one_material_per_name(root)
@@ -93,14 +93,14 @@ def repair_links_and_joints(
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
             in_chain = id(joint) in chain and joint.get("name") not in purpose.held_positions
-            check_joint(joint, links, report, in_chain=in_chain)
+            repair_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
         }
         for link in scope.findall("link"):
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
-                check_quantities(part, f"link {name}", report)
+                check_lengths_and_inertias(part, f"link {name}", report)
             at_rest = tree is not None and tree.num_joints_to_link.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
@@ -126,10 +126,10 @@ def convert_meshes_and_write_text(
     }
     text = ElementTree.tostring(root, encoding="unicode")
     limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
-    return RepairedModel(text, report.assumptions, limits, find_dependent_parts(root))
+    return RepairedModel(text, report.assumptions, limits, find_dependence_reasons(root))
 
 
-def find_dependent_parts(root: Element) -> dict[str, str]:
+def find_dependence_reasons(root: Element) -> dict[str, str]:
     """Return the joints and links that do not move independently, with the reasons."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
@@ -146,9 +146,9 @@ def _reduce_model_to_arm(
 ) -> ModelTree | None:
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in list_joints(scope)):
-            fix_joint(joint, report)
+            make_joint_fixed(joint, report)
         return None
-    if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
+    if len(scopes) != 1 or purpose.is_in_directives or scopes[0].find("include") is not None:
         return None
     link = link_of_frame(scopes[0], purpose.sensor_name) if purpose.sensor_name else ""
     return reduce_to_chain(scopes[0], link, set(purpose.held_positions), report) if link else None
@@ -175,9 +175,9 @@ def _make_names_unique(scope: Element, report: RepairReport) -> None:
 
 
 def _keep_one_material_per_name(root: Element) -> None:
-    own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
+    own = [each for each in root.iter("material") if _has_valid_colour(each) and each.get("name")]
     defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
-    defined = {name: each for name, each in defined.items() if _has_colour(each)}
+    defined = {name: each for name, each in defined.items() if _has_valid_colour(each)}
     for material in root.findall("material"):
         root.remove(material)
     for visual in root.iterfind("link/visual"):
@@ -186,12 +186,12 @@ def _keep_one_material_per_name(root: Element) -> None:
             if name in defined:
                 visual.remove(material)
                 SubElement(visual, "material", name=name)
-            elif name or not _has_colour(material):
+            elif name or not _has_valid_colour(material):
                 visual.remove(material)
     root.extend(defined.values())
 
 
-def _has_colour(material: Element) -> bool:
+def _has_valid_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
@@ -217,6 +217,6 @@ def _remove_unused_elements(root: Element, report: RepairReport) -> None:
             root.remove(motor)
             continue
         moving.discard(names[0])
-        check_quantities(motor, f"motor of {names[0]}", report)
+        check_lengths_and_inertias(motor, f"motor of {names[0]}", report)
         for actuator in motor.findall("actuator"):
             actuator.set("name", names[0])
