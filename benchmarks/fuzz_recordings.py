@@ -253,7 +253,7 @@ def full_disk(path: Path) -> None:
     with ExitStack() as last:
         _limit(target, room, last)
         file = target / ("x.parquet" if "parquet" in name else "x.csv")
-        lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.0)
+        lines.TABLE_WRITE_PERIOD_S = dict.fromkeys(lines.TABLE_WRITE_PERIOD_S, 0.0)
         sink = lines.TableSink(file)
         try:
             for k in range(rows):

@@ -61,7 +61,7 @@ class ServedCompensator:
         node.create_service(
             Trigger, "~/load", self._make_service_callback(self._reload_compensator)
         )
-        node.create_service(Trigger, "~/calibrate", self._answer_calibration)
+        node.create_service(Trigger, "~/calibrate", self._answer_calibration_request)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._current, name)
@@ -112,7 +112,7 @@ class ServedCompensator:
         self._set_scales()
         return f"done: {load.mass:.4g} kg"
 
-    async def _answer_calibration(self, _request: Any, response: Any) -> Any:
+    async def _answer_calibration_request(self, _request: Any, response: Any) -> Any:
         from rclpy.parameter import Parameter
         from rclpy.task import Future
 
