@@ -30,7 +30,7 @@ SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
 INPUTS_FILE = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
-LENGTH_UNIT_M, ANGLE_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
+INPUT_UNIT_M, INPUT_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SIGMA_UNIT, _FORCE_SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
@@ -144,15 +144,15 @@ class Inputs:
         if not self.held:
             return None
         turn = quaternion_exponential(
-            tuple(ANGLE_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
+            tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
         )
-        return np.concatenate([turn, start + LENGTH_UNIT_M * np.array([self.x, self.y, self.z])])
+        return np.concatenate([turn, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
 
     def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
         turn = quaternion_logarithm(tuple(pose[:4]))
-        places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH_UNIT_M, strict=True)
-        turns = zip(("rx", "ry", "rz"), (r / ANGLE_UNIT_RAD for r in turn), strict=True)
+        places = zip(("x", "y", "z"), (pose[4:] - start) / INPUT_UNIT_M, strict=True)
+        turns = zip(("rx", "ry", "rz"), (r / INPUT_UNIT_RAD for r in turn), strict=True)
         return self.with_changes({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property

@@ -104,7 +104,7 @@ class SessionRecord:
 
 
 class BackgroundLog(LogOnDisk):
-    """Log written by a thread; only `finish` and the next write wait for the disk."""
+    """Log written by a thread; only `wait_until_written` and the next write wait for the disk."""
 
     def __init__(
         self,
@@ -117,9 +117,9 @@ class BackgroundLog(LogOnDisk):
         self._thread = ThreadPoolExecutor(1, "log of a drive")
         self._writing: Future[Any] = self._thread.submit(import_module, "polars")
 
-    def finish(self) -> None:
+    def wait_until_written(self) -> None:
         self._writing.result()
 
     def _write_part(self, part: SimulationResult) -> None:
-        self.finish()
+        self.wait_until_written()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)

@@ -28,7 +28,7 @@ from drake_teleop.live.experiment.procedure import (
     Procedure,
 )
 from drake_teleop.live.experiment.store import TrialStore
-from drake_teleop.live.inputs import LENGTH_UNIT_M, SLICE_MS
+from drake_teleop.live.inputs import INPUT_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -117,7 +117,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
         else:
             share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
             displacement = {"z": -observer.reach * share}
-        hand = {name: value / LENGTH_UNIT_M for name, value in displacement.items()}
+        hand = {name: value / INPUT_UNIT_M for name, value in displacement.items()}
         session.apply_inputs(session.inputs.with_changes(stimulus | hand))
         session.advance(SLICE_MS)
         if session.ms % _LOG_READ_PERIOD_MS == 0:
