@@ -78,7 +78,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, In
         return found
     psi = PsiMethod(task.low, task.high)
     for row in rows:
-        psi.update(row.level, bool(row.correct))
+        psi.update_posterior(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
     mass = isinstance(task, ApparentMass)
     unit = "kg" if mass else "N"
