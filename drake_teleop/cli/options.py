@@ -151,11 +151,11 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         show_default=True,
         metavar="DIR",
         help="Output folder.",
-        callback=_remove_new_folders_at_end,
+        callback=_remove_new_empty_folders_at_end,
     )
 
 
-def _remove_new_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _remove_new_empty_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty_folders(new))

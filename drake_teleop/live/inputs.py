@@ -41,7 +41,7 @@ def choice_names() -> dict[str, tuple[str, ...]]:
     return shipped | {"method": tuple(METHODS)}
 
 
-def initial_choices(scenario: Scenario) -> dict[str, int]:
+def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
     """Return the choices (input -> integer) that leave a scenario unchanged."""
     return {
         "network": 0,
@@ -111,7 +111,7 @@ class Inputs:
             gamma=gamma,
             force_scale=round(config.force_scale / _FORCE_SCALE_UNIT),
         )
-        return started.with_changes(initial_choices(scenario))
+        return started.with_changes(choices_as_in_scenario(scenario))
 
     def with_changes(self, values: Mapping[str, Any]) -> Inputs:
         """Return the inputs with new values, clipped to their range; invalid ones are ignored."""

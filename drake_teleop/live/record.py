@@ -30,7 +30,7 @@ LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 DEVICE_MARKER_FILE = "device.txt"
 
 
-def versions_and_digest(scenario: Scenario) -> dict[str, str]:
+def versions_and_file_digest(scenario: Scenario) -> dict[str, str]:
     """Return versions of drake_teleop and Drake, and a digest of the scenario's files."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
@@ -68,7 +68,7 @@ class SessionRecord:
                 )
             if load is not None:
                 write_load(folder / LOAD_FILE, load)
-            self._append_line(csv_header(versions_and_digest(scenario)))
+            self._append_line(csv_header(versions_and_file_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
             self._remove_files()

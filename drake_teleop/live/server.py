@@ -59,7 +59,7 @@ _LOOP_ITERATIONS_PER_TICK = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
-_WAIT_CONDITION_ENDINGS = ("", " or until the device sends")
+_START_TEXT_ENDINGS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -342,7 +342,7 @@ class LiveDrive:
             if not (self._pages or self._stop.is_set()):
                 _print_to_stderr(
                     "no page is open: the simulation waits"
-                    + _WAIT_CONDITION_ENDINGS[self._device is not None]
+                    + _START_TEXT_ENDINGS[self._device is not None]
                 )
 
 
@@ -429,9 +429,7 @@ def run_drive_command(
 
 def start_condition_text(device: str | None) -> str:
     """Return as text what starts the waiting simulation."""
-    return (
-        "the simulation waits until this page is open" + _WAIT_CONDITION_ENDINGS[device is not None]
-    )
+    return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 
 def _print_to_stderr(text: str) -> None:

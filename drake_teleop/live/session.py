@@ -27,7 +27,7 @@ from drake_teleop.live.record import (
     SCENARIO_FILE,
     BackgroundLog,
     SessionRecord,
-    versions_and_digest,
+    versions_and_file_digest,
 )
 from drake_teleop.live.scenarios import (
     CROSS_FADE_S,
@@ -364,7 +364,7 @@ class RecordedDrive:
 def read_drive(folder: str | Path) -> RecordedDrive:
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO_FILE)
-    changes = read_inputs(folder / INPUTS_FILE, versions_and_digest(scenario))
+    changes = read_inputs(folder / INPUTS_FILE, versions_and_file_digest(scenario))
     load = read_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):

@@ -97,7 +97,7 @@ def evaluate_record(
     if found is not None:
         load, log = found.identification, found.log
         half, wider, degrees = half_widths_over_tolerances(found, tolerance)
-        doubts = record_problems(found)
+        doubts = doubts_about_record(found)
         sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
             phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _ASSUMED_WRENCH_NOISE)
@@ -134,7 +134,7 @@ def half_widths_over_tolerances(
     return half, sure, degrees
 
 
-def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
+def doubts_about_record(found: IdentifiedLog) -> tuple[str, ...]:
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("all poses are at rest")

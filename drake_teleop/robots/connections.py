@@ -28,7 +28,7 @@ from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Sourc
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
-_PLACEHOLDER_RATE_HZ = 1000.0
+_UNUSED_SOURCE_RATE_HZ = 1000.0
 
 
 def open_source(
@@ -98,7 +98,7 @@ def open_source_and_recorder(
     """Return the stream that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
+    rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
     if kind in PART_SOURCES:
         parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose_from_option(sensor_pose))

@@ -90,7 +90,7 @@ class MessageConverter:
     def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
         """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
-            samples = self._transform_pose(data)
+            samples = self._pose_from_transforms(data)
         else:
             values = self._message_values(name, data)
             samples = [] if values is None else [(data.header.stamp, values)]
@@ -125,7 +125,7 @@ class MessageConverter:
             [*_vector_array(data.linear_acceleration), *_vector_array(data.angular_velocity)]
         )
 
-    def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
+    def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
         self.add_transforms(data)
         if not self._frames:

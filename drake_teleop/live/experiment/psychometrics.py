@@ -30,7 +30,7 @@ def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Arr
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
-class IntervalEstimate(NamedTuple):
+class EstimateWithLimits(NamedTuple):
     """Estimate with the limits of its 95 % interval."""
 
     value: float
@@ -79,20 +79,20 @@ class PsiMethod:
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 
-    def threshold(self) -> IntervalEstimate:
+    def threshold(self) -> EstimateWithLimits:
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
         edges = math.log(self._thresholds[0]) + step * (np.arange(_NUM_GRID_THRESHOLDS + 1) - 0.5)
         below = np.concatenate([[0.0], np.cumsum(share)])
         value, low, high = np.exp(np.interp([0.5, 0.025, 0.975], below, edges))
-        return IntervalEstimate(float(value), float(low), float(high))
+        return EstimateWithLimits(float(value), float(low), float(high))
 
-    def estimate_d_prime(self, level: float) -> IntervalEstimate:
+    def estimate_d_prime(self, level: float) -> EstimateWithLimits:
         """Return the estimated sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)
         below = np.cumsum(share[order]) - 0.5 * share[order]
         found = np.interp([0.5, 0.025, 0.975], below, values[order])
-        return IntervalEstimate(*(float(x) for x in found))
+        return EstimateWithLimits(*(float(x) for x in found))
