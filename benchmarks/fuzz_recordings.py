@@ -35,7 +35,7 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
-from drake_teleop.live.record import SessionRecord, versions_and_digest
+from drake_teleop.live.record import SessionRecord, versions_and_file_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import ReadingRecorder
 from drake_teleop.robots.streams import CompensatedWrench, Reading
@@ -253,7 +253,7 @@ def full_disk(path: Path) -> None:
     with ExitStack() as last:
         _limit(target, room, last)
         file = target / ("x.parquet" if "parquet" in name else "x.csv")
-        lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.0)
+        lines.TABLE_WRITE_PERIOD_S = dict.fromkeys(lines.TABLE_WRITE_PERIOD_S, 0.0)
         sink = lines.TableSink(file)
         try:
             for k in range(rows):
@@ -312,7 +312,7 @@ def killed(path: Path) -> None:
     if text.count("\n") < 4:
         return
     changes = read_inputs(
-        folder / INPUTS_FILE, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
+        folder / INPUTS_FILE, versions_and_file_digest(LoadScenario(folder / "scenario.yaml"))
     )
     expected = [(0, 0), *((ms, ms % 1000) for ms in range(1, len(changes)))]
     if [(ms, inputs.x) for ms, inputs in changes] != expected:

@@ -69,7 +69,7 @@ def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> PsiMethod:
     psi = PsiMethod(LOW, HIGH)
     for _ in range(trials):
         level = psi.next_level()
-        psi.update(level, bool(rng.random() < curve(level)))
+        psi.update_posterior(level, bool(rng.random() < curve(level)))
     return psi
 
 

@@ -26,7 +26,7 @@ from drake_teleop.load.tolerance import (
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
 
-_BAR_CELLS, _BAR_DECADES = 24, 3.0  # cells of a bar; decades of half-width over tolerance in a bar
+_PROGRESS_CELLS, _PROGRESS_DECADES = 24, 3.0  # decades of half-width over tolerance in a bar
 
 
 def calibrate_command(
@@ -65,7 +65,7 @@ def calibrate_command(
         stream.close()
     last = looks[-1]
     summary = identify_command(path, out, quiet=True, **processing)
-    write_picture(out / "settling.png", draw_settling(looks, tolerance))
+    write_picture(out / "settling.png", draw_uncertainty_over_time(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
         "known": dict(zip(tolerance.required_entry_names, last.is_known.tolist(), strict=True)),
@@ -92,7 +92,7 @@ def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
-    table.add_column("settled", width=_BAR_CELLS)
+    table.add_column("settled", width=_PROGRESS_CELLS)
     table.add_column("verdict")
     units = [
         QUANTITY_UNITS[name]
@@ -120,9 +120,9 @@ def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
 
 
 def _make_progress_bar(half: float, known: bool) -> Text:
-    share = 1.0 - np.log10(max(half, 1.0)) / _BAR_DECADES if np.isfinite(half) else 0.0
-    cells = int(np.clip(share, 0.0, 1.0) * _BAR_CELLS)
-    return Text("█" * cells + "·" * (_BAR_CELLS - cells), style="green" if known else "yellow")
+    share = 1.0 - np.log10(max(half, 1.0)) / _PROGRESS_DECADES if np.isfinite(half) else 0.0
+    cells = int(np.clip(share, 0.0, 1.0) * _PROGRESS_CELLS)
+    return Text("█" * cells + "·" * (_PROGRESS_CELLS - cells), style="green" if known else "yellow")
 
 
 def _parameter_verdict(at: RecordEvaluation, k: int) -> str:
@@ -135,7 +135,7 @@ def _parameter_verdict(at: RecordEvaluation, k: int) -> str:
     return "almost" if at.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
+def draw_uncertainty_over_time(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

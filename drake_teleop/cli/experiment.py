@@ -69,9 +69,9 @@ def _simulate_participants(
 
     stations = make_all_apparatus(experiment, scenarios)
 
-    def progress(done: int, trials: int) -> None:
+    def print_progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)
 
     for number in range(1, count + 1):
-        simulate_participant(experiment, scenarios, stations, store, number, progress)
+        simulate_participant(experiment, scenarios, stations, store, number, print_progress)
     print()

@@ -151,11 +151,11 @@ def output_folder(command: str) -> Callable[[Any], Any]:
         show_default=True,
         metavar="DIR",
         help="Output folder.",
-        callback=_remove_new_folders_at_end,
+        callback=_remove_new_empty_folders_at_end,
     )
 
 
-def _remove_new_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _remove_new_empty_folders_at_end(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty_folders(new))
@@ -286,7 +286,7 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of a live SOURCE; those of the arm's model become the argument `arm`."""
 
     @wraps(command)
-    def with_arm(
+    def call_with_arm(
         *arguments: Any,
         model: Path | None,
         sensor_frame: str | None,
@@ -296,7 +296,7 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
         arm = _arm_from_options(model, sensor_frame, package_paths)
         return command(*arguments, arm=arm, **options)
 
-    decorated: Callable[..., Any] = with_arm
+    decorated: Callable[..., Any] = call_with_arm
     for option in (
         delay,
         cutoff_hz,

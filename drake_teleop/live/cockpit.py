@@ -19,13 +19,13 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 #: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
 MIN_CONTACT_FORCE_N = 2.0
-_AT_LIMIT_FRACTION = 0.999
-_HAND_FORCE_LIMIT_N = 59.0  # N; the limit of a hand is 60 N
-_PACKET_TIMEOUT_S = 0.05  # s
+_WARNED_LIMIT_FRACTION = 0.999
+_WARNED_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
+_WARNED_PACKET_SILENCE_S = 0.05  # s
 
 
 @njit(cache=True)
-def smallest_and_largest_norm_into(vectors, origins, out):
+def smallest_and_largest_force_into(vectors, origins, out):
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -36,7 +36,7 @@ def smallest_and_largest_norm_into(vectors, origins, out):
 
 
 @njit(cache=True)
-def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
+def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -59,8 +59,8 @@ class PageValueCalculator:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _AT_LIMIT_FRACTION * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _AT_LIMIT_FRACTION * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _WARNED_LIMIT_FRACTION * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _WARNED_LIMIT_FRACTION * arm.effort_limit),
         )
         self._peak = scenario.master.device(0.0, 0.0).peak_force
         self._energy = np.zeros(2)
@@ -72,14 +72,14 @@ class PageValueCalculator:
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        smallest_and_largest_norm_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        smallest_and_largest_norm_into(contact_S, zeros, contact)
-        smallest_and_largest_norm_into(rows["force_to_master"], zeros, rendered)
+        smallest_and_largest_force_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        smallest_and_largest_force_into(contact_S, zeros, contact)
+        smallest_and_largest_force_into(rows["force_to_master"], zeros, rendered)
         in_contact = (
             rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         )
         self._forces[:2] *= inputs.force_scales["force_scale"]
-        _integrate_work(
+        _integrate_hand_and_contact_work(
             self._table,
             rows["t"],
             rows["slave_state"],
@@ -110,18 +110,18 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _AT_LIMIT_FRACTION * self._peak:
+        if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        smallest_and_largest_norm_into(rows["hand_wrench_E"], zeros, hand)
-        if hand[1] > _HAND_FORCE_LIMIT_N:
+        smallest_and_largest_force_into(rows["hand_wrench_E"], zeros, hand)
+        if hand[1] > _WARNED_HAND_FORCE_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
             at_limit = (np.abs(rows[name][:, part]) >= limits).any(axis=0)
             if at_limit.any():
                 joints = [str(k + 1) for k in np.flatnonzero(at_limit)]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
-        if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_TIMEOUT_S:
+        if "ports" in rows and rows["ports"][:, 4:6].max() > _WARNED_PACKET_SILENCE_S:
             yield "the network delivers no packets"
         if any(abs(getattr(inputs, name)) == INPUT_RANGES[name][1] for name in ("x", "y", "z")):
             yield "the hand is at the edge of its box, 0.3 m wide"

@@ -34,8 +34,8 @@ from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
-_CLIENT_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
-_MAX_STORED_DELAYS = 100_000  # ticks
+_CLIENT_PERIOD_S, _MAX_CLIENT_PERIOD_S = 1e-3, 0.1  # s
+_MAX_STORED_FORCE_AGES = 100_000  # ticks
 
 
 class HapticDevice(Protocol):
@@ -62,7 +62,7 @@ class DeviceClient:
 
     def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.force_ages_s: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
+        self.force_ages_s: deque[float] = deque(maxlen=_MAX_STORED_FORCE_AGES)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(host_and_port(address))
@@ -70,20 +70,20 @@ class DeviceClient:
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None
 
-    def exchange_once(
+    def exchange_packets(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
         """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
         pose = self._device.read()
         now = clock()
-        self._receive_commands()
+        self._receive_force_commands()
         if pose is None:
             self._device.set_wrench((0.0,) * 6)
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
         elapsed = _CLIENT_PERIOD_S if self._last_tick is None else now - self._last_tick
-        period = min(max(elapsed, 1e-5), _MAX_LATENESS_S)
+        period = min(max(elapsed, 1e-5), _MAX_CLIENT_PERIOD_S)
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
@@ -91,7 +91,7 @@ class DeviceClient:
         self._send_pose(pose, now, age)
         return wrench
 
-    def _receive_commands(self) -> None:
+    def _receive_force_commands(self) -> None:
         while True:
             try:
                 packet = self._socket.recv(MAX_PACKET_BYTES + 1)
@@ -139,7 +139,7 @@ class RealTimeVirtualDevice:
         if self._due > now:
             time.sleep(self._due - now)
         now = time.perf_counter()
-        if now - self._due > _MAX_LATENESS_S:  # missed ticks are skipped
+        if now - self._due > _MAX_CLIENT_PERIOD_S:  # missed ticks are skipped
             self._due = self._simulated_until = now
         self.virtual.simulate_motion(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
@@ -181,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         while time.perf_counter() < end:
             largest = max(
-                largest, float(np.linalg.norm((client.exchange_once() or (0.0,) * 3)[:3]))
+                largest, float(np.linalg.norm((client.exchange_packets() or (0.0,) * 3)[:3]))
             )
     except KeyboardInterrupt:
         pass

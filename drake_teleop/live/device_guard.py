@@ -18,9 +18,9 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_S = 0.02  # s
-_FORCE_LIMIT_RISE_N_S = 100.0  # N/s
-_MAX_STORED_ENERGY_J, _ENERGY_RESERVE_J = 0.3, 3e-5  # J
-_MAX_DAMPING_NS_M = 100.0  # N s/m
+_FORCE_LIMIT_RISE_AFTER_SILENCE_N_S = 100.0  # N/s
+_MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
+_OBSERVER_DAMPING_NS_M = 100.0  # N s/m
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class DeviceGuard:
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
         self._force_limit = min(
-            self._force_limit + _FORCE_LIMIT_RISE_N_S * period, self._limits.force
+            self._force_limit + _FORCE_LIMIT_RISE_AFTER_SILENCE_N_S * period, self._limits.force
         )
         return (
             min(
@@ -93,13 +93,13 @@ class DeviceGuard:
         )
 
     def _limit_returned_energy(self, force: Array, next_motion: Array) -> Array:
-        distance, available = math.hypot(*next_motion), self._stored_energy - _ENERGY_RESERVE_J
+        distance, available = math.hypot(*next_motion), self._stored_energy - _STORED_ENERGY_KEPT_J
         returned = float(force @ next_motion)
         if returned <= available or distance < 1e-12 or not force.any():
             return force
         self.slowed += 1
         force_along = returned / distance
-        max_force = max(available / distance, -_MAX_DAMPING_NS_M * math.hypot(*self._velocity))
+        max_force = max(available / distance, -_OBSERVER_DAMPING_NS_M * math.hypot(*self._velocity))
         return force - max(force_along - max_force, 0.0) / distance * next_motion
 
 

@@ -27,14 +27,14 @@ from drake_teleop.live.device_packets import (
     rejection_reason,
     unpack_state,
 )
-from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M
+from drake_teleop.live.inputs import INPUT_UNIT_M, INPUT_UNIT_RAD
 from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
-_CLIENT_TIMEOUT_S = 2.0  # s
+_CLIENT_END_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
-_MAX_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
+_LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_TIME_S = 0.05
+_CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 
 
 class DeviceLink:
@@ -64,8 +64,8 @@ class DeviceLink:
         self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._latencies: deque[float] = deque(maxlen=_MAX_STATISTICS_PACKETS)
-        self._force_ages: deque[float] = deque(maxlen=_MAX_STATISTICS_PACKETS)
+        self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
 
     def receive_state(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
@@ -76,10 +76,10 @@ class DeviceLink:
             except (BlockingIOError, ConnectionError):
                 break
             self._handle_packet(packet, peer, now)
-        return None if self.is_silent(now) else self._state
+        return None if self.is_device_silent(now) else self._state
 
     def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
-        state, silent = unpack_state(packet), self.is_silent(now)
+        state, silent = unpack_state(packet), self.is_device_silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
             self.refusal = rejection_reason(packet) if state is None else "is from a second device"
@@ -97,7 +97,7 @@ class DeviceLink:
         self._latencies.append(now - state.t)
         self._force_ages.append(state.behind)
 
-    def is_silent(self, now: float) -> bool:
+    def is_device_silent(self, now: float) -> bool:
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send_wrench(self, wrench: np.ndarray) -> None:
@@ -110,7 +110,7 @@ class DeviceLink:
         except OSError:  # a later attempt would send an old force
             return
 
-    def reset_origin(self, now: float) -> None:
+    def reset_pose_origin(self, now: float) -> None:
         """Map the device's present pose to the station's start pose."""
         self._origin, self._connected_at = self._state, now
 
@@ -125,9 +125,9 @@ class DeviceLink:
         )
         values: dict[str, float] = {"held": 1}
         for k, name in enumerate("xyz"):
-            values[name] = (state.position[k] - first.position[k]) / LENGTH_UNIT_M
-            values["r" + name] = turn[k] / ANGLE_UNIT_RAD
-        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_TIME_S:
+            values[name] = (state.position[k] - first.position[k]) / INPUT_UNIT_M
+            values["r" + name] = turn[k] / INPUT_UNIT_RAD
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
             values["clutch"] = 0
         return values
 
@@ -136,7 +136,7 @@ class DeviceLink:
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
-            min(now - self._connected_at, 1e-3 * _MAX_STATISTICS_PACKETS)
+            min(now - self._connected_at, 1e-3 * _LINK_STATISTICS_PACKETS)
             if len(self._latencies) > 1
             else np.inf
         )
@@ -156,7 +156,7 @@ class DeviceLink:
 
     def _link_text(self) -> str:
         now = self._polled_at
-        if self.is_silent(now):
+        if self.is_device_silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
         figures = self.link_statistics(now)
@@ -208,7 +208,7 @@ class DeviceConnection:
             return
         self._client.terminate()
         try:
-            self._client.wait(_CLIENT_TIMEOUT_S)
+            self._client.wait(_CLIENT_END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._client.kill()
             self._client.wait()

@@ -37,7 +37,7 @@ from drake_teleop.station.wiring import export_outputs
 POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
 # largest slew rate [1/s].
-_LIMIT_FADE_S, _LIMIT_RETURN_RATE_PER_S, _WRENCH_SLEW_RATE_PER_S = 0.05, 4.0, 150.0
+_WRENCH_LIMIT_FADE_S, _WRENCH_LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
 (
     _HELD_INDEX,
@@ -48,7 +48,7 @@ _LIMIT_FADE_S, _LIMIT_RETURN_RATE_PER_S, _WRENCH_SLEW_RATE_PER_S = 0.05, 4.0, 15
     _PATH_SIZE,
 ) = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
-_FAULT_INDEX, _ALLOWED_SHARE, _DISPLAY_STATE_SIZE = 6, 7, 8
+_FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
 _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 
 
@@ -82,8 +82,8 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
     if not all_in_range(wrench):
         fault = _WRENCH_FAULT_NUMBER
     enabled = held and fault == 0.0
-    change = _LIMIT_RETURN_RATE_PER_S if enabled else -1.0 / _LIMIT_FADE_S
-    allowed = min(max(last[_ALLOWED_SHARE] + period * change, 0.0), 1.0)
+    change = _WRENCH_LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S
+    allowed = min(max(last[_ALLOWED_SHARE_INDEX] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
     if enabled:
         target[:] = wrench
@@ -92,10 +92,10 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit_group(step, g, _WRENCH_SLEW_RATE_PER_S * period * limits[g])
+        limit_group(step, g, _RELATIVE_WRENCH_SLEW_PER_S * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
-    now[_FAULT_INDEX], now[_ALLOWED_SHARE] = fault, allowed
+    now[_FAULT_INDEX], now[_ALLOWED_SHARE_INDEX] = fault, allowed
 
 
 class ExternalMaster(LeafSystem):
@@ -193,7 +193,7 @@ class ExternalMaster(LeafSystem):
         output[0] = context.get_discrete_state_vector().value()[_FAULT_INDEX]
 
     def _calc_wrench_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:_ALLOWED_SHARE])
+        output.SetFromVector(context.get_discrete_state_vector().value()[:_ALLOWED_SHARE_INDEX])
 
     def _calc_hand_wrench(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT_INDEX])

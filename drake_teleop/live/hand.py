@@ -55,7 +55,7 @@ TARGET_LEAD_TIME_S = 2.5 / _TRANSLATION_POLE_RAD_S
     _START_TIME_INDEX,
     _POLE_INDEX,
     _TARGET_POSE_INDEX,
-    _OFFSET_INDEX,
+    _TARGET_OFFSET_INDEX,
     _ROTATION_INDEX,
     _PATH_SIZE,
 ) = 0, 1, 2, 3, 10, 19, 25
@@ -75,9 +75,9 @@ def _intended_motion_into(path, time, pose, out):
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
         # x = (a + b t + c t^2) e^(-w t), and its derivatives
-        a, v = path[_OFFSET_INDEX + k], path[_OFFSET_INDEX + 3 + k]
+        a, v = path[_TARGET_OFFSET_INDEX + k], path[_TARGET_OFFSET_INDEX + 3 + k]
         b = v + w * a
-        c = 0.5 * (path[_OFFSET_INDEX + 6 + k] + w * (b + v))
+        c = 0.5 * (path[_TARGET_OFFSET_INDEX + 6 + k] + w * (b + v))
         x = a + t * (b + t * c)
         slope = b + 2.0 * c * t
         out[4 + k] = path[_TARGET_POSE_INDEX + 4 + k] + x * decay
@@ -129,11 +129,11 @@ def _start_path_into(path, time, now, target, poles):
     rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
     rate = _rotation_vector_rate(rotation, vector_at(now, 10))
     for k in range(3):
-        path[_OFFSET_INDEX + k], path[_OFFSET_INDEX + 3 + k] = (
+        path[_TARGET_OFFSET_INDEX + k], path[_TARGET_OFFSET_INDEX + 3 + k] = (
             now[4 + k] - target[4 + k],
             now[7 + k],
         )
-        path[_OFFSET_INDEX + 6 + k] = now[13 + k]
+        path[_TARGET_OFFSET_INDEX + 6 + k] = now[13 + k]
         path[_ROTATION_INDEX + k], path[_ROTATION_INDEX + 3 + k] = rotation[k], rate[k]
 
 
@@ -167,7 +167,7 @@ class LiveHand(Operator):
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
-        path[_HELD_INDEX], path[_POLE_INDEX], path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = (
+        path[_HELD_INDEX], path[_POLE_INDEX], path[_TARGET_POSE_INDEX:_TARGET_OFFSET_INDEX] = (
             1.0,
             _TRANSLATION_POLE_RAD_S,
             self._intent[1],
@@ -214,7 +214,7 @@ class LiveHand(Operator):
             path,
             context.get_time(),
             intention,
-            path[_TARGET_POSE_INDEX:_OFFSET_INDEX].copy(),
+            path[_TARGET_POSE_INDEX:_TARGET_OFFSET_INDEX].copy(),
             _GRIP_CHANGE_POLE_RAD_S,
         )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)

@@ -30,7 +30,7 @@ SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
 INPUTS_FILE = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
-LENGTH_UNIT_M, ANGLE_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
+INPUT_UNIT_M, INPUT_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SIGMA_UNIT, _FORCE_SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
@@ -41,7 +41,7 @@ def choice_names() -> dict[str, tuple[str, ...]]:
     return shipped | {"method": tuple(METHODS)}
 
 
-def initial_choices(scenario: Scenario) -> dict[str, int]:
+def choices_as_in_scenario(scenario: Scenario) -> dict[str, int]:
     """Return the choices (input -> integer) that leave a scenario unchanged."""
     return {
         "network": 0,
@@ -111,7 +111,7 @@ class Inputs:
             gamma=gamma,
             force_scale=round(config.force_scale / _FORCE_SCALE_UNIT),
         )
-        return started.with_changes(initial_choices(scenario))
+        return started.with_changes(choices_as_in_scenario(scenario))
 
     def with_changes(self, values: Mapping[str, Any]) -> Inputs:
         """Return the inputs with new values, clipped to their range; invalid ones are ignored."""
@@ -144,15 +144,15 @@ class Inputs:
         if not self.held:
             return None
         turn = quaternion_exponential(
-            tuple(ANGLE_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
+            tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
         )
-        return np.concatenate([turn, start + LENGTH_UNIT_M * np.array([self.x, self.y, self.z])])
+        return np.concatenate([turn, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
 
     def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
         turn = quaternion_logarithm(tuple(pose[:4]))
-        places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH_UNIT_M, strict=True)
-        turns = zip(("rx", "ry", "rz"), (r / ANGLE_UNIT_RAD for r in turn), strict=True)
+        places = zip(("x", "y", "z"), (pose[4:] - start) / INPUT_UNIT_M, strict=True)
+        turns = zip(("rx", "ry", "rz"), (r / INPUT_UNIT_RAD for r in turn), strict=True)
         return self.with_changes({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property

@@ -43,11 +43,11 @@ _MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two fram
 DISPLAYED_TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
 # of messages.
-_SLEEP_DELAY_S, _SLICES_PER_TICK = 0.25, 4
-_MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
+_MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
+_MIN_SHOWN_UNRENDERED_FORCE_N = 0.05  # N, smallest removed force that the page reports
 _RELEASED_HAND_INPUTS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
-_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
+_SESSION_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
 #: Largest message [bytes]; a longer one closes the connection.
 MAX_MESSAGE_BYTES = 4096
@@ -106,7 +106,7 @@ class Live:
         self._folder = "" if folder is None else str(folder)
         self._session.apply_inputs(self._session.inputs.with_changes(self._initial))
         if self._link is not None:
-            self._link.reset_origin(now)
+            self._link.reset_pose_origin(now)
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
@@ -218,7 +218,7 @@ class Live:
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
-        for _ in range(_SLICES_PER_TICK):
+        for _ in range(_MAX_SLICES_PER_TICK):
             now = clock()
             if self.is_simulation_halted or self.pace.time_to_next_slice(now) > 0:
                 break
@@ -226,7 +226,7 @@ class Live:
             self._simulate_slice(now)
         now = clock()
         self._poll_device(now)
-        if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_DELAY_S:
+        if self._driver is None and not self._asleep and now - self._alone_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._stop_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
@@ -249,7 +249,7 @@ class Live:
     def _stop_on_failure(self, action: Callable[[], None]) -> None:
         try:
             action()
-        except _FAILURE_EXCEPTIONS as error:
+        except _SESSION_FAILURE_EXCEPTIONS as error:
             self.stopped = to_one_line(str(error))
 
     def _simulate_slice(self, now: float) -> None:
@@ -261,7 +261,7 @@ class Live:
             self._session.apply_inputs(
                 self._limited_inputs(self._requested.with_changes(by_device))
             )
-        except _FAILURE_EXCEPTIONS as error:
+        except _SESSION_FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
                 self.stopped = to_one_line(str(error))
@@ -295,7 +295,7 @@ class Live:
         if self._session.is_channel_filling:
             words = ["a new channel starts: the clutch is open until its packets arrive", *words]
         removed = self._session.force_above_limit()
-        if removed > _MIN_REMOVED_FORCE_N:
+        if removed > _MIN_SHOWN_UNRENDERED_FORCE_N:
             words = [f"{removed:.1f} N are not rendered until the hand presses less", *words]
         if self._refusal:
             words = [self._refusal, *words]

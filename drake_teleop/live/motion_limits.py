@@ -6,16 +6,16 @@ import math
 from collections.abc import Mapping
 
 from drake_teleop.live.hand import TARGET_LEAD_TIME_S
-from drake_teleop.live.inputs import ANGLE_UNIT_RAD, INPUT_RANGES, LENGTH_UNIT_M, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, INPUT_UNIT_M, INPUT_UNIT_RAD, Inputs
 
-_RATE_TIMEOUT_S = 1.0  # s
+_RATE_INPUT_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
 _LEAD_TIMES_S = dict.fromkeys(("x", "y", "z"), TARGET_LEAD_TIME_S) | dict.fromkeys(
     ("rx", "ry", "rz"), 0.0
 )
 # Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
 # limited only for a device; the path of a page's hand is smooth.
-_TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
+_TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
@@ -31,7 +31,7 @@ class RateInputs:
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES_S}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES_S}
-        self._end_time = now + _RATE_TIMEOUT_S
+        self._end_time = now + _RATE_INPUT_TIMEOUT_S
         return inputs.with_changes(self._at)
 
     def advance_inputs(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
@@ -53,8 +53,8 @@ class MotionLimiter:
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _AxisLimiter] = {}
         limits = (
-            (("x", "y", "z"), LENGTH_UNIT_M, _TRANSLATION_LIMITS),
-            (("rx", "ry", "rz"), ANGLE_UNIT_RAD, _ROTATION_LIMITS),
+            (("x", "y", "z"), INPUT_UNIT_M, _TOOL_TRANSLATION_LIMITS),
+            (("rx", "ry", "rz"), INPUT_UNIT_RAD, _TOOL_ROTATION_LIMITS),
         )
         for (names, unit, (speed, acceleration)), scale in zip(limits, scales, strict=True):
             units = slice_s / (unit * max(scale, 1e-3))

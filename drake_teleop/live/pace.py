@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 #: Lateness above which lost time is not caught up [s].
-_MAX_LATENESS_S = 0.1
-_STATISTICS_SLICES = 400  # slices
+_MAX_CAUGHT_UP_LATENESS_S = 0.1
+_PACE_STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
@@ -23,8 +23,8 @@ class Pace:
     def __init__(self, slice_s: float, now: float) -> None:
         self.slowdown, self.lost_time_s = 1.0, 0.0
         self._slice = slice_s
-        self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
-        self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
+        self._lateness: deque[float] = deque(maxlen=_PACE_STATISTICS_SLICES)
+        self._starts: deque[float] = deque(maxlen=_PACE_STATISTICS_SLICES)
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -36,7 +36,7 @@ class Pace:
 
     def begin_slice(self, now: float) -> None:
         late = now - self._due
-        if late > _MAX_LATENESS_S:
+        if late > _MAX_CAUGHT_UP_LATENESS_S:
             self.lost_time_s += late
             self._due = now
         self._lateness.append(late)

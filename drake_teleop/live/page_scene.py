@@ -19,7 +19,7 @@ from drake_teleop.station.scenario import Scenario
 
 LogRows = dict[str, NDArray[np.float64]]
 
-_FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
+_SCENE_FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
 # Commands in base64 and their files in the static page of Meshcat.
 _MESHCAT_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
@@ -43,8 +43,8 @@ class PageScene:
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _scene_objects_json(meshcat.StaticHtml())
-            self._scene.canvas = _ChangeRecorder()  # only this thread may destroy Meshcat
-        except _FAILURE_EXCEPTIONS as error:
+            self._scene.canvas = _SceneChangeRecorder()  # only this thread may destroy Meshcat
+        except _SCENE_FAILURE_EXCEPTIONS as error:
             self._report_failure(error)
 
     def frame_part(self, rows: LogRows) -> dict[str, Any]:
@@ -53,11 +53,11 @@ class PageScene:
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
     def _poses_and_sizes(self, rows: LogRows) -> dict[str, Any]:
-        moves = _ChangeRecorder()
+        moves = _SceneChangeRecorder()
         try:
             self._scene.canvas = moves
             self._scene.show_sample(0.0, rows, -1)
-        except _FAILURE_EXCEPTIONS as error:
+        except _SCENE_FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._report_failure(error)
             return {}
@@ -68,7 +68,7 @@ class PageScene:
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
 
-class _ChangeRecorder:
+class _SceneChangeRecorder:
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}
         self._sizes: dict[str, list[float]] = {}

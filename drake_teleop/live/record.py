@@ -30,7 +30,7 @@ LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 DEVICE_MARKER_FILE = "device.txt"
 
 
-def versions_and_digest(scenario: Scenario) -> dict[str, str]:
+def versions_and_file_digest(scenario: Scenario) -> dict[str, str]:
     """Return versions of drake_teleop and Drake, and a digest of the scenario's files."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
@@ -68,7 +68,7 @@ class SessionRecord:
                 )
             if load is not None:
                 write_load(folder / LOAD_FILE, load)
-            self._append_line(csv_header(versions_and_digest(scenario)))
+            self._append_line(csv_header(versions_and_file_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
             self._remove_files()
@@ -104,7 +104,7 @@ class SessionRecord:
 
 
 class BackgroundLog(LogOnDisk):
-    """Log written by a thread; only `finish` and the next write wait for the disk."""
+    """Log written by a thread; only `wait_until_written` and the next write wait for the disk."""
 
     def __init__(
         self,
@@ -117,9 +117,9 @@ class BackgroundLog(LogOnDisk):
         self._thread = ThreadPoolExecutor(1, "log of a drive")
         self._writing: Future[Any] = self._thread.submit(import_module, "polars")
 
-    def finish(self) -> None:
+    def wait_until_written(self) -> None:
         self._writing.result()
 
     def _write_part(self, part: SimulationResult) -> None:
-        self.finish()
+        self.wait_until_written()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)

@@ -28,8 +28,8 @@ DEFAULT_OBJECT = Payload(mass=0.8)
 CROSS_FADE_S = 0.25
 # Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
 # ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
-_MIN_ROTATIONAL_IMPEDANCE = 0.5
-_DELAY_UNIT_S, _JITTER_UNIT, _LOSS_UNIT = 1e-4, 1e-2, 1e-3
+_MIN_ROTATIONAL_WAVE_IMPEDANCE = 0.5
+_DELAY_INPUT_UNIT_S, _JITTER_INPUT_UNIT, _LOSS_INPUT_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the user.
 _SCENARIO_OF_SCENE = {
@@ -83,16 +83,16 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
     if method == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
         wave = dataclasses.replace(
-            scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_IMPEDANCE)]
+            scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE)]
         )
         changes["passivity__wave"] = wave
     name = NETWORKS[inputs.network]
     if name == "custom":
         changes["channel"] = Channel(
-            delay=_DELAY_UNIT_S * inputs.delay,
-            jitter=_JITTER_UNIT * inputs.jitter,
+            delay=_DELAY_INPUT_UNIT_S * inputs.delay,
+            jitter=_JITTER_INPUT_UNIT * inputs.jitter,
             distribution="gamma",
-            loss=_LOSS_UNIT * inputs.loss,
+            loss=_LOSS_INPUT_UNIT * inputs.loss,
         )
     elif name != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=name)
@@ -125,18 +125,18 @@ def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario)
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _sensor_offset(now) - _sensor_offset(before)
+    estimate[:6] += _wrist_sensor_offset(now) - _wrist_sensor_offset(before)
     arms = (NominalSlave(scenario.slave).arm for scenario in (now, before))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 
 
-def _sensor_offset(scenario: Scenario) -> Array:
+def _wrist_sensor_offset(scenario: Scenario) -> Array:
     sensor = scenario.wrist_sensor
     return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
 
 
-def channel_fill_time(scenario: Scenario) -> float:
+def channel_fill_time_s(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
     if scenario.has_direct_channel:
         return 0.0

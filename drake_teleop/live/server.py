@@ -53,13 +53,13 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
 _HOST = "127.0.0.1"
-_MAX_PAGES = 8
+_MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
 _LOOP_ITERATIONS_PER_TICK = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
-_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
-_WAIT_CONDITION_ENDINGS = ("", " or until the device sends")
+_PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
+_START_TEXT_ENDINGS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -203,7 +203,7 @@ class LiveDrive:
                 compression=None,
                 ping_interval=5,
                 ping_timeout=5,
-                close_timeout=_CLOSE_TIMEOUT_S,
+                close_timeout=_PAGE_CLOSE_TIMEOUT_S,
                 logger=_LOGGER,
             )
         except OSError as error:
@@ -222,7 +222,7 @@ class LiveDrive:
             finally:
                 server.close()
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
+                    await asyncio.wait_for(server.wait_closed(), 2 * _PAGE_CLOSE_TIMEOUT_S)
 
     async def _run_loop(self, server: Server) -> None:
         refusal = ""
@@ -325,7 +325,7 @@ class LiveDrive:
 
     async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
-        if len(connection.server.connections) > _MAX_PAGES:
+        if len(connection.server.connections) > _MAX_CONNECTED_PAGES:
             await connection.close(1013, "too many pages")
             return
         number = self._pages[connection] = next(self._page_numbers)
@@ -342,7 +342,7 @@ class LiveDrive:
             if not (self._pages or self._stop.is_set()):
                 _print_to_stderr(
                     "no page is open: the simulation waits"
-                    + _WAIT_CONDITION_ENDINGS[self._device is not None]
+                    + _START_TEXT_ENDINGS[self._device is not None]
                 )
 
 
@@ -429,9 +429,7 @@ def run_drive_command(
 
 def start_condition_text(device: str | None) -> str:
     """Return as text what starts the waiting simulation."""
-    return (
-        "the simulation waits until this page is open" + _WAIT_CONDITION_ENDINGS[device is not None]
-    )
+    return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 
 def _print_to_stderr(text: str) -> None:

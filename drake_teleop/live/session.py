@@ -27,15 +27,15 @@ from drake_teleop.live.record import (
     SCENARIO_FILE,
     BackgroundLog,
     SessionRecord,
-    versions_and_digest,
+    versions_and_file_digest,
 )
 from drake_teleop.live.scenarios import (
     CROSS_FADE_S,
     adapt_estimate,
-    channel_fill_time,
+    channel_fill_time_s,
     chosen_scenario,
 )
-from drake_teleop.live.station_swap import copy_state
+from drake_teleop.live.station_swap import copy_station_state
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_of
@@ -59,7 +59,7 @@ _MIN_INTEGRATION_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
 _MAX_CHANNEL_CHANGE_FORCE_RISE_N = 0.9
 # Duration of short steps after a rejected one [s].
-_SHORT_STEPS_DURATION_S = 4e-3
+_SHORT_STEPS_AFTER_REJECTION_S = 4e-3
 _NO_EVENT_STATUS = EventStatus.DidNothing()
 
 
@@ -79,7 +79,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
-            rejected, until = number, context.get_time() + _SHORT_STEPS_DURATION_S
+            rejected, until = number, context.get_time() + _SHORT_STEPS_AFTER_REJECTION_S
             integrator.set_maximum_step_size(shortest)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
@@ -142,16 +142,16 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def continue_from(self, other: _Station, new_channel: bool) -> float:
+    def continue_from_station(self, other: _Station, new_channel: bool) -> float:
         """Copy another station's state; return how long the clutch must stay open [s]."""
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
-        copy_state(other.station, other.context, self.station, self.context, excluded)
+        copy_station_state(other.station, other.context, self.station, self.context, excluded)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block_and_context("wrist_sensor")
             sensor.reset_queue(context)
-        wait_s = channel_fill_time(self.scenario) if new_channel else 0.0
+        wait_s = channel_fill_time_s(self.scenario) if new_channel else 0.0
         cross_fade, context = self.block_and_context("cross_fade")
         rendered = other.signal_value("force_to_master")
         cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
@@ -235,7 +235,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.continue_from(
+        wait_s = station.continue_from_station(
             self._station, inputs.channel_choices != self.inputs.channel_choices
         )
         if wait_s:
@@ -310,7 +310,7 @@ class Session:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
             self._on_disk.write_and_keep()
-            self._on_disk.finish()
+            self._on_disk.wait_until_written()
 
     def _recorded_signals(self) -> SimulationResult:
         return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
@@ -364,7 +364,7 @@ class RecordedDrive:
 def read_drive(folder: str | Path) -> RecordedDrive:
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO_FILE)
-    changes = read_inputs(folder / INPUTS_FILE, versions_and_digest(scenario))
+    changes = read_inputs(folder / INPUTS_FILE, versions_and_file_digest(scenario))
     load = read_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):

@@ -22,10 +22,10 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 
 #: Blocks whose parameters change during a live session.
-_BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
+_BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
-def copy_state(
+def copy_station_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
     """Copy time, states, changeable parameters of `before` to `station`, except `excluded`."""
@@ -39,10 +39,10 @@ def copy_state(
             or excluded & set(path.split("/"))
         ):
             continue
-        _copy_block(
+        _copy_block_state(
             source_block.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
-            path.rpartition("/")[2] in _BLOCKS_WITH_PARAMETERS,
+            path.rpartition("/")[2] in _BLOCKS_WITH_CHANGED_PARAMETERS,
         )
 
 
@@ -55,7 +55,7 @@ def _blocks_by_path(diagram: Diagram, path: str = "") -> Iterator[tuple[str, Sys
             yield name, system
 
 
-def _copy_block(source: Context, target: Context, with_parameters: bool) -> None:
+def _copy_block_state(source: Context, target: Context, with_parameters: bool) -> None:
     if source.num_continuous_states() == target.num_continuous_states() > 0:
         target.SetContinuousState(source.get_continuous_state_vector().CopyToVector())
     groups = source.num_discrete_state_groups()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
-_STEPS_PER_MS = 10  # per ms
+_SIMULATION_STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
@@ -32,7 +32,7 @@ class VirtualDevice:
 
     def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
         """Simulate `seconds` under a constant force (3,) on the hand [N]."""
-        steps = max(math.ceil(seconds * 1e3 * _STEPS_PER_MS - 1e-9), 1)
+        steps = max(math.ceil(seconds * 1e3 * _SIMULATION_STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):
             self._t += h

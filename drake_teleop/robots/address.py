@@ -52,7 +52,7 @@ class Address:
             )
         return values
 
-    def chosen_word(self, name: str, among: tuple[str, ...]) -> str:
+    def parameter_among_words(self, name: str, among: tuple[str, ...]) -> str:
         """Return a parameter, one of the words `among` (default: the first)."""
         text = self._parameters.get(name, among[0])
         if text not in among:

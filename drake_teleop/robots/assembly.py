@@ -40,7 +40,7 @@ from drake_teleop.robots.streams import (
     Reading,
     ReadingFlag,
 )
-from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, unfiltered_noise
+from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, white_wrench_noise
 
 DELAY_FORGETTING_TIME_S = 10.0
 """Time constant of the weights [s]."""
@@ -50,13 +50,13 @@ MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
-MAX_INITIAL_DELAY_ERROR_S = 0.03
+INLIER_DELAY_ERROR_AT_START_S = 0.03
 """Delay error that the residual of a sample may contain before the delay is known [s]."""
-MAX_TRACKED_DELAY_ERROR_S = 0.004
+INLIER_DELAY_ERROR_TRACKED_S = 0.004
 """Delay error in a residual once the delay is known, besides the remaining correction [s]."""
 DELAY_SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
-_MAX_NOISE_SIGMAS, _MIN_DELAY_SAMPLES = 5.0, 50  # samples before offsets are estimated
+_MAX_INLIER_RESIDUAL_SIGMAS, _MIN_DELAY_SAMPLES = 5.0, 50  # samples before offsets are estimated
 
 TimedMotion = tuple[float, Array]
 """Time [s], and s, omega, alpha (9,)."""
@@ -69,7 +69,7 @@ class DelayTracker:
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
     ) -> None:
         self.delay_s = delay_s
-        self._phi, self._noise = tuple(usable_phi(load)[0]), unfiltered_noise(load, dt, cutoff_hz)
+        self._phi, self._noise = tuple(usable_phi(load)[0]), white_wrench_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
         self._reset_estimate(-math.inf)
@@ -81,7 +81,7 @@ class DelayTracker:
     def _reset_estimate(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
-        self._delay_error = MAX_INITIAL_DELAY_ERROR_S
+        self._delay_error = INLIER_DELAY_ERROR_AT_START_S
 
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
@@ -112,7 +112,7 @@ class DelayTracker:
 
     def _is_inlier(self, residual: Array, slope: Array) -> bool:
         starting = self._samples < _MIN_DELAY_SAMPLES
-        limit = _MAX_NOISE_SIGMAS * self._noise + self._delay_error * np.abs(slope)
+        limit = _MAX_INLIER_RESIDUAL_SIGMAS * self._noise + self._delay_error * np.abs(slope)
         limit += (
             LOAD_WRENCH_ERROR_FRACTION * np.abs(self._wrenches[0])
             + starting * MAX_SENSOR_OFFSET_DRIFT
@@ -132,22 +132,22 @@ class DelayTracker:
         estimate = float(self._weights @ (gr - g * r)) / information
         rest = rr - r * r - estimate * (gr - g * r)
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
-        self._delay_error = MAX_INITIAL_DELAY_ERROR_S
+        self._delay_error = INLIER_DELAY_ERROR_AT_START_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
             max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
             self._delay_error = min(
-                MAX_INITIAL_DELAY_ERROR_S, MAX_TRACKED_DELAY_ERROR_S + abs(correction)
+                INLIER_DELAY_ERROR_AT_START_S, INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
             )
 
 
 _GRAVITY_W = np.array([0.0, 0.0, -9.81])
 IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
 """Identity: the sensor's frame is the posed frame."""
-_BUFFER_TIME_S = 0.5  # buffer of motions and wrenches
+_STREAM_BUFFER_S = 0.5  # buffer of motions and wrenches
 _MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
-_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
+_MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
 class PartStreams:
@@ -246,7 +246,7 @@ class MotionWindow:
 
     def _measure_period(self, step: float) -> None:
         self._steps.append(step)
-        if len(self._steps) == _PERIOD_MEDIAN_SAMPLES:
+        if len(self._steps) == _MOTION_PERIOD_MEDIAN_SAMPLES:
             self._dt = float(np.median(self._steps))
             self._weights = polynomial_fit_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
@@ -311,7 +311,7 @@ def pose_from_rpy(numbers: Sequence[float]) -> Array:
     return np.concatenate([quaternions_from_matrices(R)[0], numbers[:3]])
 
 
-class _ClockOffset:
+class _StreamClockOffset:
     def __init__(self) -> None:
         self.offset, self._now = math.inf, 0.0
 
@@ -354,9 +354,9 @@ class ReadingAssembler:
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / cutoff_hz + delay_s)
-        self._clocks = _ClockOffset(), _ClockOffset()
+        self._clocks = _StreamClockOffset(), _StreamClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
-        self._pending: deque[Part] = deque(maxlen=round(_BUFFER_TIME_S / self.dt))
+        self._pending: deque[Part] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
 
     @property
     def delay_s(self) -> float:
@@ -391,13 +391,13 @@ class ReadingAssembler:
 
     def _store_motion(self, t: float, motion: Array) -> None:
         motions = self._motions
-        if motions and not motions[-1][0] - STALE_AGE_S < t < motions[-1][0] + _BUFFER_TIME_S:
+        if motions and not motions[-1][0] - STALE_AGE_S < t < motions[-1][0] + _STREAM_BUFFER_S:
             motions.clear()  # another clock: wrenches on the old one would wait forever
-            waiting = [each for each in self._pending if not abs(each.t - t) > _BUFFER_TIME_S]
+            waiting = [each for each in self._pending if not abs(each.t - t) > _STREAM_BUFFER_S]
             self._pending = deque(waiting, self._pending.maxlen)
         if math.isfinite(t) and (not motions or t > motions[-1][0]):
             motions.append((t, motion))
-            while t - motions[0][0] > _BUFFER_TIME_S:
+            while t - motions[0][0] > _STREAM_BUFFER_S:
                 motions.popleft()
 
     def _complete_reading(self, part: Part) -> Reading | None:

@@ -31,7 +31,7 @@ from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.recording import SampleRecorder
 from drake_teleop.robots.streams import Source
 
-REQUIRED_CONFIDENCE = 0.9998
+TOLERANCE_CONFIDENCE = 0.9998
 """Level of the interval that must be within the tolerance."""
 RECORD_GROWTH_FACTOR = 1.12
 """Growth factor of the record from one result to the next."""
@@ -42,9 +42,9 @@ MIN_DEGREES_OF_FREEDOM = 20.0
 _RESTART_ADVICE = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY_M_S2 = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
-_INITIAL_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
-_INITIAL_NOISE_STD = np.repeat([0.25, 0.012], 3)
-_REGULARIZATION = 1e-12  # relative information that keeps matrices regular
+_ASSUMED_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
+_ASSUMED_WRENCH_NOISE = np.repeat([0.25, 0.012], 3)
+_RELATIVE_GRAM_REGULARIZATION = 1e-12  # relative information that keeps matrices regular
 # Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _ADVISED_MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
@@ -52,7 +52,7 @@ _ADVISED_MOTIONS = (
 )
 _ADVISED_MOTION_S, _ADVISED_MOTION_SAMPLES = 4.0, 80
 # Independent samples per second and hertz of the low-pass.
-_INDEPENDENT_RATE_PER_HZ = 2.2
+_SAMPLES_PER_CUTOFF_PERIOD = 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class RecordEvaluation:
     Attributes:
         identified_log: the identification; None if it failed for the reason `failure`.
         relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
-        is_within_tolerance: (k,) True where the interval of level `REQUIRED_CONFIDENCE` is.
+        is_within_tolerance: (k,) True where the interval of level `TOLERANCE_CONFIDENCE` is.
         is_known: (k,) True where the previous result was within the tolerance, too.
         doubts: problems of the record; no parameter is known then.
     """
@@ -93,14 +93,14 @@ def evaluate_record(
         why = str(error)
     half, sure = np.full(count, np.inf), np.zeros(count, bool)
     doubts: tuple[str, ...] = ()
-    phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE_STD, None
+    phi, noise, log = _ASSUMED_PHI, _ASSUMED_WRENCH_NOISE, None
     if found is not None:
         load, log = found.identification, found.log
         half, wider, degrees = half_widths_over_tolerances(found, tolerance)
-        doubts = record_problems(found)
+        doubts = doubts_about_record(found)
         sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
-            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE_STD)
+            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _ASSUMED_WRENCH_NOISE)
     known = sure & (previous is not None and previous.is_within_tolerance)
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGE_CAUSES] if found else []
     with suppress(DrakeTeleopError):  # too few samples
@@ -122,19 +122,19 @@ def evaluate_record(
 def half_widths_over_tolerances(
     found: IdentifiedLog, tolerance: Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return (k,) each: half-widths (95 %, `REQUIRED_CONFIDENCE`), degrees of freedom."""
+    """Return (k,) each: half-widths (95 %, `TOLERANCE_CONFIDENCE`), degrees of freedom."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
     half, sure = (
-        stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, REQUIRED_CONFIDENCE)
+        stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, TOLERANCE_CONFIDENCE)
     )
     return half, sure, degrees
 
 
-def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
+def doubts_about_record(found: IdentifiedLog) -> tuple[str, ...]:
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("all poses are at rest")
@@ -154,12 +154,12 @@ def advise_motion(
 
     `motion` is s, omega, alpha of the record, (N, 3) each.
     """
-    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_RATE_PER_HZ * cutoff_hz)
+    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
     equations = NormalEquations(noise)
     equations.add(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
     size = np.sqrt(np.diag(gram).max()) + 1.0
-    gram = gram + _REGULARIZATION * size**2 * np.eye(16)
+    gram = gram + _RELATIVE_GRAM_REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _candidate_information_matrices(last, noise, rate):
@@ -196,7 +196,7 @@ def _candidate_information_matrices(
 
 DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
-_READ_TIMEOUT_S = 0.05
+_STREAM_READ_TIMEOUT_S = 0.05
 _SampleT = TypeVar("_SampleT")
 
 
@@ -221,7 +221,7 @@ def calibrate(
         previous = results[-1] if results else None
         return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
 
-    def finish(result: RecordEvaluation) -> bool:
+    def store_evaluation(result: RecordEvaluation) -> bool:
         results.append(result)
         show(result)
         return bool(result.is_known.all())
@@ -236,7 +236,7 @@ def calibrate(
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
             while not (done or INTERRUPTED_EVENT.is_set()):
-                if (samples := source.read(_READ_TIMEOUT_S)) is None:
+                if (samples := source.read(_STREAM_READ_TIMEOUT_S)) is None:
                     break
                 for sample in samples:
                     recorder.add(sample)
@@ -247,7 +247,7 @@ def calibrate(
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
-                        done, pending = finish(pending.result()), None
+                        done, pending = store_evaluation(pending.result()), None
                         if done:
                             break
                 done = done or recorder.longest_part_s >= seconds
@@ -256,8 +256,8 @@ def calibrate(
             write_record()
         raise
     if pending is not None:
-        finish(pending.result())
+        store_evaluation(pending.result())
     if not results or not results[-1].is_known.all():
         write_record()
-        finish(evaluate())
+        store_evaluation(evaluate())
     return results

@@ -27,21 +27,21 @@ from drake_teleop.robots.streams import (
     ReadingFlag,
 )
 
-RECORD_SPAN_S = 20.0
+TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_TRIGGER_FLAGS, _INVALID_FLAGS = (
+_TEST_TRIGGER_FLAGS, _INVALID_FLAGS = (
     int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD),
     ~int(NONZERO_WRENCH_FLAGS),
 )
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
-_MAX_TEST_SPACING_S, _MIN_UNFLAGGED_TIME_S, _MIN_CHANGE_SPACING_S = 10.0, 1.0, 1.0
-_MIN_RECORD_S, _MIN_LIKELIHOOD_RATIO = 4.0, 40.0
-_MIN_SPECIFIC_FORCE_STD = (
+_MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
+_MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
+_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE = (
     0.5  # m/s^2, minimum standard deviation of the specific force after a change
 )
-_PROCESS_NICENESS, _TEST_TIMEOUT_S = 10, 60.0
+_CHANGE_TEST_NICENESS, _CHANGE_TEST_TIMEOUT_S = 10, 60.0
 
 TimedChangeText = tuple[float, str]
 """Time of a change [s], and the change in words."""
@@ -52,7 +52,7 @@ class ChangeMonitor:
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
-        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_READING_VALUES))
+        self._rows = np.zeros((round(TESTED_RECORD_SPAN_S / dt), 1 + NUM_READING_VALUES))
         self._count, self._last = 0, -math.inf
         self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
         self._executor = ThreadPoolExecutor(1, "changes of a stream")
@@ -68,11 +68,11 @@ class ChangeMonitor:
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
         self._count += 1
-        if flags & _TRIGGER_FLAGS:
+        if flags & _TEST_TRIGGER_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
                 self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S
-        elif t - self._last_flagged > _MIN_UNFLAGGED_TIME_S:
+        elif t - self._last_flagged > _MAX_PAUSE_IN_FLAGGED_TIME_S:
             self._flagged_since = math.inf
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
             self._next_attempt = t + min(
@@ -102,7 +102,7 @@ class ChangeMonitor:
             self._report(f"the test for a tare or another load failed ({error})")
             return
         for time, words in found.result():
-            if all(abs(time - t) > _MIN_CHANGE_SPACING_S for t in self._reported):
+            if all(abs(time - t) > _MIN_REPORTED_CHANGE_SPACING_S for t in self._reported):
                 self._reported.append(time)
                 self._next_attempt = self._last + _MAX_TEST_SPACING_S
                 self._report(words)
@@ -113,7 +113,7 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[TimedChangeText]:
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
         stdout=subprocess.PIPE,
-        timeout=_TEST_TIMEOUT_S,
+        timeout=_CHANGE_TEST_TIMEOUT_S,
         check=True,
         start_new_session=True,  # Ctrl-C stops the loop only
     )
@@ -124,7 +124,7 @@ def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
-    if len(t) * dt < _MIN_RECORD_S:
+    if len(t) * dt < _MIN_TESTED_RECORD_S:
         return []
     wrench, *motion = np.split(rows[at, 1:], [6, 9, 12], axis=1)
     lost = np.abs(rows[at, 0] - t) > dt
@@ -134,21 +134,21 @@ def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
         for cause in causes_of_fit(state)
         if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
-        and _is_change_decisive(state, cause.start_s)
+        and _is_change_kind_certain(state, cause.start_s)
     ]
 
 
-def _is_change_decisive(state: State, time: float) -> bool:
+def _is_change_kind_certain(state: State, time: float) -> bool:
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE]
-    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD:
+    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE:
         return False
     own = next(step for step in steps if step.time == time)
     other = StepChange("offsets" if own.kind == "load" else "load", own.time)
     model = replace(state.model, steps=(*(step for step in steps if step != own), other))
     start = np.zeros(model.size)
     start[:17] = state.x[:17]
-    return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _MIN_LIKELIHOOD_RATIO
+    return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _KIND_LIKELIHOOD_RATIO
 
 
 def _change_text(cause: Cause) -> str:
@@ -166,7 +166,7 @@ def _change_text(cause: Cause) -> str:
 
 def main() -> None:
     if hasattr(os, "nice"):
-        os.nice(_PROCESS_NICENESS)
+        os.nice(_CHANGE_TEST_NICENESS)
     rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_READING_VALUES)
     json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
 

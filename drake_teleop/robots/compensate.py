@@ -71,14 +71,14 @@ def compensate_stream(
                 report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def longest_wait_s() -> float:
+    def longest_read_timeout_s() -> float:
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _STALE_WRENCH_PERIOD_S) if left > 0.0 else _STALE_WRENCH_PERIOD_S
 
     with suppress(KeyboardInterrupt), handle_sigint():
         while (
             not INTERRUPTED_EVENT.is_set()
-            and (readings := source.read(longest_wait_s())) is not None
+            and (readings := source.read(longest_read_timeout_s())) is not None
         ):
             if (
                 source.live

@@ -58,17 +58,17 @@ _MAX_TIME_STAMP_S = 1e12  # [s]
 _ZERO_GRAVITY = np.zeros(3)
 _MAX_READING_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `ReadingFlag` takes a microsecond.
-_DAMAGED, _STALE, _CLIPPED = (
+_DAMAGED_FLAG, _STALE_FLAG, _CLIPPED_FLAG = (
     int(ReadingFlag.DAMAGED),
     int(ReadingFlag.STALE),
     int(ReadingFlag.CLIPPED),
 )
-_NONZERO_WRENCH_FLAGS, _GAP, _WRONG_RATE = (
+_NONZERO_WRENCH_FLAGS, _GAP_FLAG, _WRONG_RATE_FLAG = (
     int(NONZERO_WRENCH_FLAGS),
     int(ReadingFlag.GAP),
     int(ReadingFlag.WRONG_RATE),
 )
-_IN_CONTACT = int(ReadingFlag.IN_CONTACT)
+_IN_CONTACT_FLAG = int(ReadingFlag.IN_CONTACT)
 _FLAG_OF_PROBLEM = {
     VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,
     VALUE_TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
@@ -76,7 +76,7 @@ _FLAG_OF_PROBLEM = {
 }
 # Maximum rms of the wrench at rest, as a multiple of the residual of the identification, and at
 # least [N, N m].
-_MAX_REST_NOISE_RATIO, _MIN_REST_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
+_MAX_REST_WRENCH_RMS_OVER_RESIDUAL, _MIN_REST_WRENCH_RMS_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
 class _RateCheck:
@@ -95,7 +95,7 @@ class _RateCheck:
         if self._count > self._readings:
             spacing = (reading.t - self._start_t) / max(1, reading.number - self._start_number)
             wrong = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
-            self._flag, self._count = _WRONG_RATE if wrong else 0, 0
+            self._flag, self._count = _WRONG_RATE_FLAG if wrong else 0, 0
         return self._flag
 
 
@@ -141,7 +141,7 @@ class Compensator:
             [np.minimum(_MAX_READING_VALUES[:6], 2.0 * self._range), _MAX_READING_VALUES[6:]]
         )
         self._noise_limit = np.maximum(
-            _MAX_REST_NOISE_RATIO * load.residual_rms, _MIN_REST_NOISE_LIMIT
+            _MAX_REST_WRENCH_RMS_OVER_RESIDUAL * load.residual_rms, _MIN_REST_WRENCH_RMS_LIMIT
         )
         self._memory = np.full((2, 12), np.nan)
         self._delay_line: deque[Array] = deque(maxlen=wait + 1)
@@ -190,7 +190,7 @@ class Compensator:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
         flags = self._reading_flags(reading, now)
         invalid = flags & ~_NONZERO_WRENCH_FLAGS
-        if invalid & ~_GAP:
+        if invalid & ~_GAP_FLAG:
             return self._zero_output(flags)
         if now - self._now > STALE_AGE_S:
             self._reset_filters()
@@ -201,18 +201,18 @@ class Compensator:
         if self._watch is not None:
             flags |= self._watch.reading_flags(reading.values)
         if self._detector is not None:
-            flags &= ~_IN_CONTACT
+            flags &= ~_IN_CONTACT_FLAG
             flags |= self._detector.contact_flag(reading.values, self._delay_line[-1][:6])
         wrench = self._delay_line[0].copy()
         if clip_wrenches(wrench, self._range):
-            flags |= _CLIPPED
+            flags |= _CLIPPED_FLAG
         return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
     def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
         if now - self._now <= STALE_AGE_S:
             return None
-        return self._zero_output(_STALE)
+        return self._zero_output(_STALE_FLAG)
 
     def time_to_stale(self, now: float) -> float:
         return max(0.0, self._now + STALE_AGE_S - now)
@@ -250,8 +250,8 @@ class Compensator:
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags
-        if flags & _DAMAGED:
-            return _DAMAGED
+        if flags & _DAMAGED_FLAG:
+            return _DAMAGED_FLAG
         problem = reading_problem(reading.values, self._largest, self._range)
         if not math.isfinite(reading.t):
             problem = VALUE_NOT_FINITE
@@ -281,7 +281,7 @@ class Compensator:
         elif now - self._last_in_time > CLOCK_JUMP_S:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
-            flags |= _STALE
+            flags |= _STALE_FLAG
         return flags | self._rate.wrong_rate_flag(reading)
 
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:

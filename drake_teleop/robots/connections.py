@@ -28,7 +28,7 @@ from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Sourc
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
-_PLACEHOLDER_RATE_HZ = 1000.0
+_UNUSED_SOURCE_RATE_HZ = 1000.0
 
 
 def open_source(
@@ -98,7 +98,7 @@ def open_source_and_recorder(
     """Return the stream that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
+    rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
     if kind in PART_SOURCES:
         parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose_from_option(sensor_pose))
@@ -177,7 +177,7 @@ def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 
-def _make_stream(module: str, class_name: str, *arguments: Any) -> Any:
+def _make_source_or_sink(module: str, class_name: str, *arguments: Any) -> Any:
     """Return an instance of a class in a module of `robots`, whose libraries are optional."""
     return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
@@ -190,14 +190,14 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
     "source of parts",
     {
         "posed": lambda address, hz, joints: PosedSource(address, _require_period_s(hz, address)),
-        "rtde": lambda address, hz, joints: _make_stream("rtde", "RtdeSource", address),
-        "netft": lambda address, hz, joints: _make_stream(
+        "rtde": lambda address, hz, joints: _make_source_or_sink("rtde", "RtdeSource", address),
+        "netft": lambda address, hz, joints: _make_source_or_sink(
             "netft", "NetFtSource", address, None if hz is None else 1.0 / hz
         ),
-        "zenoh": lambda address, hz, joints: _make_stream(
+        "zenoh": lambda address, hz, joints: _make_source_or_sink(
             "ros2_zenoh", "ZenohSource", address, _require_period_s(hz, address), joints
         ),
-        "ros2": lambda address, hz, joints: _make_stream(
+        "ros2": lambda address, hz, joints: _make_source_or_sink(
             "ros2", "Ros2Source", address, _require_period_s(hz, address), joints
         ),
     },
@@ -208,12 +208,12 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": lambda address: _make_stream("ros2_zenoh", "ZenohSink", address),
-        "ros2": lambda address: _make_stream("ros2", "Ros2Sink", address),
-        "foxglove": lambda address: _make_stream("foxglove", "FoxgloveSink", address),
+        "zenoh": lambda address: _make_source_or_sink("ros2_zenoh", "ZenohSink", address),
+        "ros2": lambda address: _make_source_or_sink("ros2", "Ros2Sink", address),
+        "foxglove": lambda address: _make_source_or_sink("foxglove", "FoxgloveSink", address),
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": lambda address: _make_stream("foxglove", "McapSink", Path(address)),
+        ".mcap": lambda address: _make_source_or_sink("foxglove", "McapSink", Path(address)),
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""

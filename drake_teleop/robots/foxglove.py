@@ -16,7 +16,7 @@ from drake_teleop.robots.udp import host_and_port
 DEFAULT_SERVER_PORT = 8765
 WRENCH_TOPIC = "/wrench"
 _WRENCH_SCHEMA = {"type": "object", "properties": {c: {"type": "number"} for c in WRENCH_COLUMNS}}
-_MESSAGE_SCHEMA = {
+_OUTPUT_SCHEMA = {
     "title": "drake_teleop.Wrench",
     "type": "object",
     "properties": {
@@ -35,7 +35,7 @@ class _WrenchChannel:
         import foxglove
 
         self.context = foxglove.Context()
-        self._channel = foxglove.Channel(WRENCH_TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
+        self._channel = foxglove.Channel(WRENCH_TOPIC, schema=_OUTPUT_SCHEMA, context=self.context)
 
     def log_wrench(self, out: CompensatedWrench, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}

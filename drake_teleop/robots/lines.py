@@ -108,7 +108,7 @@ class JsonLineSink(Sink):
 
 
 #: Time between two writes [s]; a killed process loses its rows. A Parquet file takes milliseconds.
-WRITE_PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
+TABLE_WRITE_PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
 
 
 class TableSink:
@@ -119,7 +119,7 @@ class TableSink:
 
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
-        self._path, self._period = path, WRITE_PERIOD_S[path.suffix]
+        self._path, self._period = path, TABLE_WRITE_PERIOD_S[path.suffix]
         self._rows: list[CompensatedWrench] = []
         self._written, self._end = 0, 0  # rows; bytes of the CSV file
         self._due = -np.inf

@@ -25,9 +25,9 @@ RECORD_FORMAT = struct.Struct(">III6i")
 START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
 _SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
-_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
+_STREAM_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
 _MAX_RECORDS_PER_CALL = 256  # records per call
-_PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
+_SETTINGS_PAGE_TIMEOUT_S, _MAX_SETTINGS_PAGE_BYTES = 2.0, 1 << 20
 _SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
@@ -93,7 +93,7 @@ class NetFtSource:
 
     def _request_stream(self) -> None:
         now = time.monotonic()
-        if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
+        if now - max(self._last_received, self._last_request) > _STREAM_REQUEST_PERIOD_S:
             self._last_request = now
             self._send_command(START_COMMAND)
 
@@ -111,10 +111,10 @@ def _read_counts_and_rate(address: Address) -> list[float]:
 
     remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
     where = f"http://{address.host}/netftapi2.xml"
-    connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
+    connection = HTTPConnection(address.host, timeout=_SETTINGS_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return parse_counts_and_rate(connection.getresponse().read(_MAX_PAGE_BYTES))
+        return parse_counts_and_rate(connection.getresponse().read(_MAX_SETTINGS_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
@@ -141,8 +141,8 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
     return values
 
 
-_MIN_CLOCK_SPAN_S, _MAX_CLOCK_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
-_RESTART_STEP_S = 1.0  # a larger step of the number is a restart
+_MIN_PERIOD_MEASUREMENT_S, _MAX_PERIOD_MEASUREMENT_S = 1.0, 10.0  # span of our clock
+_SAMPLE_NUMBER_RESTART_STEP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
@@ -159,11 +159,11 @@ class SampleClock:
     def time_of_sample(self, number: int, now: float) -> float:
         """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
         step = number - self._number
-        if self._first is None or abs(step) * self._dt > _RESTART_STEP_S:
+        if self._first is None or abs(step) * self._dt > _SAMPLE_NUMBER_RESTART_STEP_S:
             self._first = number, now
-        elif now - self._first[1] >= _MIN_CLOCK_SPAN_S and number > self._first[0]:
+        elif now - self._first[1] >= _MIN_PERIOD_MEASUREMENT_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])
-            if now - self._first[1] > _MAX_CLOCK_SPAN_S:
+            if now - self._first[1] > _MAX_PERIOD_MEASUREMENT_S:
                 self._first = number, now
         t = self._t + step * self._period
         if step > 0 or self._first == (number, now):

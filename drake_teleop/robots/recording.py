@@ -45,7 +45,7 @@ _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
 }
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
 _QUATERNION_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
-_NEW_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
+_NEW_CLOCK_CONFIRMATION_SAMPLES = 50  # successive samples that confirm another clock
 _SampleT = TypeVar("_SampleT")
 
 
@@ -85,17 +85,17 @@ class SampleRecorder(ABC, Generic[_SampleT]):
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _SampleSeries()
         self.left_out += not (samples if same_clock else other).add(t, values, now)
-        if len(other.t) == _NEW_CLOCK_SAMPLES:
+        if len(other.t) == _NEW_CLOCK_CONFIRMATION_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
             self._part, self._other_clock = self._other_clock, self._make_empty_part()
 
     def _longest_part(self) -> dict[str, _SampleSeries]:
-        return max(self._part, self._longest, key=_duration_s)
+        return max(self._part, self._longest, key=_min_stream_duration_s)
 
     @property
     def longest_part_s(self) -> float:
-        return _duration_s(self._longest_part())
+        return _min_stream_duration_s(self._longest_part())
 
     @abstractmethod
     def add(self, sample: _SampleT) -> None:
@@ -214,5 +214,5 @@ class _SampleSeries:
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 
-def _duration_s(part: dict[str, _SampleSeries]) -> float:
+def _min_stream_duration_s(part: dict[str, _SampleSeries]) -> float:
     return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in part.values())

@@ -19,17 +19,17 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged_part,
+    damaged_part_of_topic,
     domain_of_address,
-    source_topics,
     topic_of_address,
+    topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, CompensatedWrench, Part, ReadingFlag
 
 _NODE_NAME = "drake_teleop"
-_DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
+_MAX_DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
 _MAX_QUEUED_MESSAGES = 256  # queued messages of a stream
-_SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
+_MAX_SERVICE_SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
 
 
 class RosNode:
@@ -96,7 +96,7 @@ class Ros2Source:
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
         parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
-        topics, frames, self.streams = source_topics(parsed, joints)
+        topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
         self._found: list[Part] = []
@@ -114,7 +114,7 @@ class Ros2Source:
             self._take_messages()
         elif time.monotonic() >= self._next_spin:  # services, under a constant load
             self._node.spin(0.0)
-            self._next_spin = time.monotonic() + _SPIN_PERIOD_S
+            self._next_spin = time.monotonic() + _MAX_SERVICE_SPIN_PERIOD_S
         found, self._found = self._found, []
         return found
 
@@ -140,7 +140,7 @@ class Ros2Source:
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(damaged_part(name))
+                self._found.append(damaged_part_of_topic(name))
                 return
             self._found += self._converter.parts_of_message(name, data, number)
 
@@ -169,7 +169,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data
 
         topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.chosen_word("wrench", ("contact", "scaled"))
+        self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
         kinds += ["diagnostic_msgs/msg/KeyValue"]
@@ -200,7 +200,7 @@ class Ros2Sink:
         self._counts.update(flag_names(out.flags) if out.flags else ())
         now = time.monotonic()
         if out.flags != self._flags or now >= self._next:
-            self._flags, self._next = out.flags, now + _DIAGNOSTICS_PERIOD_S
+            self._flags, self._next = out.flags, now + _MAX_DIAGNOSTICS_PERIOD_S
             self._diagnostics.publish(self._diagnostics_message(out, ns))
 
     def close(self) -> None:

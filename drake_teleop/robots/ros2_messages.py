@@ -21,7 +21,7 @@ MESSAGE_TYPE_OF_TOPIC = {
     JOINTS: "sensor_msgs/msg/JointState",
 }
 _STREAM_OF_TOPIC = {"tf": POSE}
-_MAX_FRAMES = 64  # frames in a chain
+_MAX_TRANSFORM_CHAIN_FRAMES = 64  # frames in a chain
 SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
@@ -48,7 +48,7 @@ def topic_of_address(address: Address, text: str) -> str:
     return topic
 
 
-def source_topics(
+def topics_frames_and_streams(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
     """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
@@ -74,7 +74,7 @@ def source_topics(
     return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
 
 
-def damaged_part(name: str) -> Part:
+def damaged_part_of_topic(name: str) -> Part:
     return DAMAGED_WRENCH_PART._replace(stream=_STREAM_OF_TOPIC.get(name, name))
 
 
@@ -90,7 +90,7 @@ class MessageConverter:
     def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
         """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
-            samples = self._transform_pose(data)
+            samples = self._pose_from_transforms(data)
         else:
             values = self._message_values(name, data)
             samples = [] if values is None else [(data.header.stamp, values)]
@@ -125,14 +125,14 @@ class MessageConverter:
             [*_vector_array(data.linear_acceleration), *_vector_array(data.angular_velocity)]
         )
 
-    def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
+    def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
         self.add_transforms(data)
         if not self._frames:
             return []
         parent, frame = self._frames
         pose, stamp = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
-        for _ in range(_MAX_FRAMES):
+        for _ in range(_MAX_TRANSFORM_CHAIN_FRAMES):
             if frame == parent:
                 return [] if stamp is None else [(stamp, pose)]
             if frame not in self._links:

@@ -53,15 +53,15 @@ class ServedCompensator:
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCE)
         node.declare_parameter("seconds", 120.0)
-        node.add_on_set_parameters_callback(self._check_scales)
-        node.add_post_set_parameters_callback(lambda _: self._set_scales())
+        node.add_on_set_parameters_callback(self._check_scale_parameters)
+        node.add_post_set_parameters_callback(lambda _: self._apply_scale_parameters())
         node.create_service(
             Trigger, "~/tare", self._make_service_callback(lambda: self._current.tare())
         )
         node.create_service(
             Trigger, "~/load", self._make_service_callback(self._reload_compensator)
         )
-        node.create_service(Trigger, "~/calibrate", self._answer_calibration)
+        node.create_service(Trigger, "~/calibrate", self._answer_calibration_request)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._current, name)
@@ -78,12 +78,12 @@ class ServedCompensator:
     def _parameter_value(self, name: str) -> Any:
         return self._node.get_parameter(name).value
 
-    def _set_scales(self) -> None:
+    def _apply_scale_parameters(self) -> None:
         sigma, gamma, *others = (self._parameter_value(name) for name in _SCALE_NAMES)
         weight, inertia = (None if value < 0.0 else value for value in others)
         self._current.set_scales(sigma, gamma, weight, inertia)
 
-    def _check_scales(self, parameters: list[Any]) -> Any:
+    def _check_scale_parameters(self, parameters: list[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
@@ -109,10 +109,10 @@ class ServedCompensator:
     def _reload_compensator(self) -> str:
         compensator = self._make(load := Identification.load(self._parameter_value("load")))
         self._current = compensator
-        self._set_scales()
+        self._apply_scale_parameters()
         return f"done: {load.mass:.4g} kg"
 
-    async def _answer_calibration(self, _request: Any, response: Any) -> Any:
+    async def _answer_calibration_request(self, _request: Any, response: Any) -> Any:
         from rclpy.parameter import Parameter
         from rclpy.task import Future
 

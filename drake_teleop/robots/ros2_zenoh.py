@@ -19,10 +19,10 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged_part,
+    damaged_part_of_topic,
     domain_of_address,
-    source_topics,
     topic_of_address,
+    topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import CompensatedWrench, Part
 
@@ -85,7 +85,7 @@ def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
     return _ATTACHMENT_FORMAT.pack(number, ns, len(sender), sender)
 
 
-def message_number(attached: bytes) -> int | None:
+def number_in_attachment(attached: bytes) -> int | None:
     if len(attached) == _ATTACHMENT_FORMAT.size:
         return int(_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
     if (
@@ -118,13 +118,13 @@ class CdrConverter(MessageConverter):
 
     def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
         self._counts[name] += 1
-        number = message_number(attachment)
+        number = number_in_attachment(attachment)
         if number is None:
             number = self._counts[name]
         try:
             data = self._types.deserialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])
         except self._damaged:
-            return [damaged_part(name)]
+            return [damaged_part_of_topic(name)]
         return self.parts_of_message(name, data, number)
 
 
@@ -137,7 +137,7 @@ class ZenohSource:
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
         parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
-        topics, frames, self.streams = source_topics(parsed, joints)
+        topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         require_libraries(address)
         self.messages = CdrConverter(sign, frames, joints)
         self._queue: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
@@ -179,7 +179,7 @@ class ZenohSink:
     def __init__(self, address: str) -> None:
         parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
-        which = parsed.chosen_word("wrench", ("contact", "scaled"))
+        which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which
         self._frame = parsed.optional_parameter("frame") or ""

@@ -18,8 +18,8 @@ from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 RTDE_PORT = 30004
-_START_TIMEOUT_S = 10.0  # wait for the robot at the start
-_MIN_RESTART_PERIOD_S = 0.2  # between two starts of the child
+_FIRST_SAMPLES_TIMEOUT_S = 10.0  # wait for the robot at the start
+_MIN_READER_RESTART_PERIOD_S = 0.2  # between two starts of the child
 _RATE_MEASUREMENT_SAMPLES = 5  # samples for the rate
 _READ_BLOCK_BYTES = 65536
 
@@ -38,10 +38,10 @@ class RtdeSource:
         require_library("rtde_receive", "ur_rtde", "robots", address)
         self._host, self._sign = parsed.host, parsed.wrench_sign()
         self._partial, self._started = b"", 0.0
-        self._start_process()
+        self._start_reader_process()
         quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
-        deadline = time.monotonic() + _START_TIMEOUT_S
+        deadline = time.monotonic() + _FIRST_SAMPLES_TIMEOUT_S
         while (
             len(self._first) < _RATE_MEASUREMENT_SAMPLES
             and (left := deadline - time.monotonic()) > 0.0
@@ -66,18 +66,18 @@ class RtdeSource:
             return []
         block = os.read(self._pipe, _READ_BLOCK_BYTES)
         if not block:
-            if time.monotonic() - self._started > _MIN_RESTART_PERIOD_S:
-                self._stop_process()
-                self._start_process()
+            if time.monotonic() - self._started > _MIN_READER_RESTART_PERIOD_S:
+                self._stop_reader_process()
+                self._start_reader_process()
             else:
-                time.sleep(min(timeout_s, _MIN_RESTART_PERIOD_S))
+                time.sleep(min(timeout_s, _MIN_READER_RESTART_PERIOD_S))
             return []
         block = self._partial + block
         complete = len(block) - len(block) % SAMPLE_FORMAT.size
         self._partial = block[complete:]
         return list(SAMPLE_FORMAT.iter_unpack(block[:complete]))
 
-    def _start_process(self) -> None:
+    def _start_reader_process(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"
         self._pipe, into = os.pipe()
         self._child = subprocess.Popen(
@@ -89,13 +89,13 @@ class RtdeSource:
         os.close(into)
         self._partial, self._started = b"", time.monotonic()
 
-    def _stop_process(self) -> None:
+    def _stop_reader_process(self) -> None:
         self._child.kill()
         self._child.wait()
         os.close(self._pipe)
 
     def close(self) -> None:
-        self._stop_process()
+        self._stop_reader_process()
 
 
 def parts_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:

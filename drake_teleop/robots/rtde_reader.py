@@ -13,7 +13,7 @@ import time
 SAMPLE_FORMAT = struct.Struct("<16d")
 """Time of the controller [s], raw wrench (6), TCP pose (6), tool acceleration (3)."""
 RTDE_VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accelerometer")
-_POLL_PERIOD_S, _MAX_SILENCE_S = 0.0002, 1.0
+_ROBOT_POLL_PERIOD_S, _MAX_ROBOT_SILENCE_S = 0.0002, 1.0
 
 
 def write_samples_to_pipe(host: str, pipe: int) -> None:
@@ -21,12 +21,12 @@ def write_samples_to_pipe(host: str, pipe: int) -> None:
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(RTDE_VARIABLES))
     last, new = -1.0, time.monotonic()
-    while robot.isConnected() and time.monotonic() - new < _MAX_SILENCE_S:
+    while robot.isConnected() and time.monotonic() - new < _MAX_ROBOT_SILENCE_S:
         t = robot.getTimestamp()
         wrench, pose = robot.getFtRawWrench(), robot.getActualTCPPose()
         acceleration = robot.getActualToolAccelerometer()
         if t == last or t != robot.getTimestamp():  # no new sample, or a mixture of two
-            time.sleep(_POLL_PERIOD_S)
+            time.sleep(_ROBOT_POLL_PERIOD_S)
             continue
         last, new = t, time.monotonic()
         os.write(pipe, SAMPLE_FORMAT.pack(t, *wrench, *pose, *acceleration))

@@ -35,20 +35,20 @@ from drake_teleop.robots.streams import ReadingFlag
 
 LOAD_WRENCH_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
-MIN_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
+MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_UNREACHABLE_LOAD_ACCURACY = 1e-12  # accuracy at which another load would replace the present one
+_LOAD_REPLACEMENT_ACCURACY = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
-def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
+def white_wrench_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
     """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
     share = (
         1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH_OVER_CUTOFF * cutoff_hz * dt)
     )
     return np.maximum(
-        load.residual_rms / math.sqrt(share), MIN_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt)
+        load.residual_rms / math.sqrt(share), MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt)
     )
 
 
@@ -56,14 +56,14 @@ class ContactAndLoadMonitor:
     """Detector of contact and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
-        noise = unfiltered_noise(load, dt, cutoff_hz)
+        noise = white_wrench_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_detector_parameters(
             noise,
             np.zeros(9),
             dt,
             model_error=LOAD_WRENCH_ERROR_FRACTION,
-            bound=_UNREACHABLE_LOAD_ACCURACY,
+            bound=_LOAD_REPLACEMENT_ACCURACY,
         )
         self._phi = usable_phi(load)[0]
         self._covariance = limit_covariance(self._phi, load.covariance)
@@ -90,7 +90,7 @@ MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
 _CONTACT_STATISTIC = "level"
-_RATE_TOLERANCE = 0.05
+_FREE_LOG_RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
@@ -107,7 +107,7 @@ class StreamContactDetector:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
             raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
-        if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
+        if abs(source.dt / dt - 1.0) > _FREE_LOG_RATE_TOLERANCE:
             raise DrakeTeleopError(
                 f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz",
                 where=str(free),

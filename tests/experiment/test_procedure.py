@@ -213,5 +213,5 @@ def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, h
     rows, psi = store.read_rows(1), PsiMethod(low, high)
     assert not all(row.correct for row in rows[:3])
     assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]
-    psi.update(rows[3].level, bool(rows[3].correct))
+    psi.update_posterior(rows[3].level, bool(rows[3].correct))
     assert rows[4].level == psi.next_level()

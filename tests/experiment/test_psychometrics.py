@@ -17,17 +17,17 @@ def test_the_threshold_is_where_d_prime_is_1():
 def test_next_level_minimises_the_expected_entropy():
     psi = PsiMethod(0.2, 20.0)
     for level, correct in ((2.0, True), (1.0, False), (0.9, True)):
-        psi.update(level, correct)
+        psi.update_posterior(level, correct)
 
     def expected(level: float) -> float:
         """Return the expected entropy of the threshold, by explicit updates of the grid."""
         posterior = psi._posterior
-        p = float((psi._correct_probability(level) * posterior).sum())
+        p = float((psi._grid_correct_probability(level) * posterior).sum())
         after = []
         for correct in (True, False):
             other = PsiMethod(0.2, 20.0)
             other._posterior = posterior.copy()
-            other.update(level, correct)
+            other.update_posterior(level, correct)
             share = other._posterior.sum(axis=(1, 2))
             after.append(-float(share @ np.log(share)))
         return p * after[0] + (1.0 - p) * after[1]
@@ -44,7 +44,7 @@ def test_intervals_contain_the_true_thresholds():
         psi = PsiMethod(0.2, 20.0)
         for _ in range(40):
             level = psi.next_level()
-            psi.update(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
+            psi.update_posterior(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
         found, d = psi.threshold(), psi.estimate_d_prime(truth)
         held.append(found.low <= truth <= found.high and d.low <= 1.0 <= d.high)
         off.append(abs(np.log(found.value / truth)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.live.external_master import (
-    _ALLOWED_SHARE,
+    _ALLOWED_SHARE_INDEX,
     _DISPLAY_STATE_SIZE,
     _FAULT_INDEX,
     MakeExternalMasterSide,
@@ -40,11 +40,11 @@ def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_wrench_that_is_not_finite_is_a_fault_and_fades(place, value):
     last, now, wrench = np.zeros(_DISPLAY_STATE_SIZE), np.empty(_DISPLAY_STATE_SIZE), np.ones(6)
-    last[0], last[_ALLOWED_SHARE] = 2.0, 1.0
+    last[0], last[_ALLOWED_SHARE_INDEX] = 2.0, 1.0
     wrench[place] = value
     _update_displayed_wrench(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
     assert now[_FAULT_INDEX] > 0.0
-    assert now[_ALLOWED_SHARE] == pytest.approx(0.98)
+    assert now[_ALLOWED_SHARE_INDEX] == pytest.approx(0.98)
     np.testing.assert_allclose(now[:6], [2.0 - 0.15 * 4.0, 0, 0, 0, 0, 0])
 
 

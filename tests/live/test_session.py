@@ -293,7 +293,7 @@ def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tm
         changes.append((session.ms, session.inputs.with_changes({"x": session.ms})))
         session.apply_inputs(changes[-1][1])
         session.advance(100)
-    session._on_disk.finish()  # the thread has written all parts taken so far
+    session._on_disk.wait_until_written()  # the thread has written all parts taken so far
     assert list(read_drive(tmp_path).changes)[1:] == changes[1:]
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     assert log.t[-1] >= 1e-3 * session.ms - 2.0

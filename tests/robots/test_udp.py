@@ -203,7 +203,7 @@ import numpy as np
 from pathlib import Path
 from drake_teleop.robots import lines
 from drake_teleop.robots.streams import CompensatedWrench
-lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.02)
+lines.TABLE_WRITE_PERIOD_S = dict.fromkeys(lines.TABLE_WRITE_PERIOD_S, 0.02)
 sink = lines.TableSink(Path(sys.argv[1]))
 for k in range(10**6):
     sink.write(CompensatedWrench(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
@@ -247,7 +247,7 @@ class Failing:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
-    monkeypatch.setattr(lines, "WRITE_PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
+    monkeypatch.setattr(lines, "TABLE_WRITE_PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
         failing = Failing(lines.TableSink(tmp_path / name))
         failing.write_until(CannotWrite)

@@ -29,7 +29,7 @@ _MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
 _FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
-_MAX_FLOOR_DISTANCE_M, _MIN_FLOOR_TIME_S = 2e-3, 0.2
+_MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
 def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
@@ -126,7 +126,7 @@ class IntervalLog:
         self._slave, self._insert = NominalSlave(scenario.slave), insert
         self._on_floor: float | None = None
 
-    def add(self, rows: dict[str, Array]) -> None:
+    def add_rows(self, rows: dict[str, Array]) -> None:
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -140,11 +140,11 @@ class IntervalLog:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
-        if tip[2] - insert.translation[2] + insert.depth > _MAX_FLOOR_DISTANCE_M:
+        if tip[2] - insert.translation[2] + insert.depth > _MAX_SLOT_FLOOR_DISTANCE_M:
             self._on_floor = None
         elif self._on_floor is None:
             self._on_floor = self.time
-        elif self.time - self._on_floor >= _MIN_FLOOR_TIME_S:
+        elif self.time - self._on_floor >= _MIN_SLOT_FLOOR_TIME_S:
             self.done_at = self._on_floor
 
     def largest_contact_force(self) -> float:

@@ -73,14 +73,14 @@ class GuidedExperiment:
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
         self._stimulus = self._apparatus.stimulus_inputs(
-            procedure.current_level, procedure.expected_force
+            procedure.current_level, procedure.expected_contact_force
         )
         name = f"{procedure.trial_number:04}-{procedure.interval}"
         self._live = Live(
             with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
             self._drives / f"{procedure.participant:02}" / name,
-            self._add_rows,
+            self._log_and_show_rows,
             now,
             self._link,
             log=False,
@@ -90,8 +90,8 @@ class GuidedExperiment:
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _add_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
-        self._rows.add(rows)
+    def _log_and_show_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+        self._rows.add_rows(rows)
         hidden = ("measured_wrench_S", "load_estimate")
         return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
 

@@ -109,7 +109,7 @@ class Procedure:
         return self.level if self.trial.signal_interval == self.interval else 0.0
 
     @property
-    def expected_force(self) -> float:
+    def expected_contact_force(self) -> float:
         """Median of the participant's contact forces up to now [N]."""
         task = self.task
         if self._pressed:
@@ -191,7 +191,7 @@ class Procedure:
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
             self._pressed.append(row.force_N)
         if not trial.practice:
-            self._psi[trial.task, trial.condition].update(row.level, bool(row.correct))
+            self._psi[trial.task, trial.condition].update_posterior(row.level, bool(row.correct))
 
     def _start_next_trial(self) -> None:
         before = self.trials[self.trial_number - 1]

@@ -20,8 +20,8 @@ _NUM_GRID_THRESHOLDS = 81
 _GRID_SLOPES = np.geomspace(0.7, 3.0, 7)
 _GRID_LAPSE_RATES = np.array([0.0, 0.02, 0.04, 0.08])
 # Factor of the range of thresholds beyond the range of levels.
-_THRESHOLD_RANGE_FACTOR = 2.0
-_NUM_LEVELS = 25
+_MAX_THRESHOLD_OVER_LEVEL = 2.0
+_NUM_STIMULUS_LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
@@ -30,7 +30,7 @@ def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Arr
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
-class IntervalEstimate(NamedTuple):
+class EstimateWithLimits(NamedTuple):
     """Estimate with the limits of its 95 % interval."""
 
     value: float
@@ -42,9 +42,9 @@ class PsiMethod:
     """Psi method: posterior of threshold, slope and lapse, for levels `low` > 0 to `high`."""
 
     def __init__(self, low: float, high: float) -> None:
-        self.levels = np.geomspace(low, high, _NUM_LEVELS)
+        self.levels = np.geomspace(low, high, _NUM_STIMULUS_LEVELS)
         self._thresholds = np.geomspace(
-            low / _THRESHOLD_RANGE_FACTOR, high * _THRESHOLD_RANGE_FACTOR, _NUM_GRID_THRESHOLDS
+            low / _MAX_THRESHOLD_OVER_LEVEL, high * _MAX_THRESHOLD_OVER_LEVEL, _NUM_GRID_THRESHOLDS
         )
         self._grid = tuple(
             np.meshgrid(
@@ -55,11 +55,11 @@ class PsiMethod:
         self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
         self._p_correct = np.stack(
-            [self._correct_probability(x).reshape(shape) for x in self.levels]
+            [self._grid_correct_probability(x).reshape(shape) for x in self.levels]
         )
-        self._p_correct = self._p_correct.reshape(_NUM_LEVELS, _NUM_GRID_THRESHOLDS, -1)
+        self._p_correct = self._p_correct.reshape(_NUM_STIMULUS_LEVELS, _NUM_GRID_THRESHOLDS, -1)
 
-    def _correct_probability(self, level: float) -> Array:
+    def _grid_correct_probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
@@ -67,32 +67,32 @@ class PsiMethod:
         posterior = self._posterior.reshape(_NUM_GRID_THRESHOLDS, -1)
         right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
         wrong = posterior.sum(axis=1) - right
-        lost = np.zeros(_NUM_LEVELS)
+        lost = np.zeros(_NUM_STIMULUS_LEVELS)
         for joint in (right, wrong):
             lost -= xlogy(joint, joint).sum(axis=1)
             total = joint.sum(axis=1)
             lost += xlogy(total, total)
         return float(self.levels[np.argmin(lost)])
 
-    def update(self, level: float, correct: bool) -> None:
-        p = self._correct_probability(level)
+    def update_posterior(self, level: float, correct: bool) -> None:
+        p = self._grid_correct_probability(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 
-    def threshold(self) -> IntervalEstimate:
+    def threshold(self) -> EstimateWithLimits:
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
         edges = math.log(self._thresholds[0]) + step * (np.arange(_NUM_GRID_THRESHOLDS + 1) - 0.5)
         below = np.concatenate([[0.0], np.cumsum(share)])
         value, low, high = np.exp(np.interp([0.5, 0.025, 0.975], below, edges))
-        return IntervalEstimate(float(value), float(low), float(high))
+        return EstimateWithLimits(float(value), float(low), float(high))
 
-    def estimate_d_prime(self, level: float) -> IntervalEstimate:
+    def estimate_d_prime(self, level: float) -> EstimateWithLimits:
         """Return the estimated sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)
         below = np.cumsum(share[order]) - 0.5 * share[order]
         found = np.interp([0.5, 0.025, 0.975], below, values[order])
-        return IntervalEstimate(*(float(x) for x in found))
+        return EstimateWithLimits(*(float(x) for x in found))

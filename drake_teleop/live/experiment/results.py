@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
-from drake_teleop.live.experiment.psychometrics import IntervalEstimate, PsiMethod
+from drake_teleop.live.experiment.psychometrics import EstimateWithLimits, PsiMethod
 from drake_teleop.live.experiment.store import TrialRow, TrialStore, table_schema
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
     return found
 
 
-def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, IntervalEstimate]:
+def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
@@ -78,7 +78,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, In
         return found
     psi = PsiMethod(task.low, task.high)
     for row in rows:
-        psi.update(row.level, bool(row.correct))
+        psi.update_posterior(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
     mass = isinstance(task, ApparentMass)
     unit = "kg" if mass else "N"
@@ -86,22 +86,22 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, In
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
-def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> IntervalEstimate:
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> EstimateWithLimits:
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
         half = float(stdtrit(len(x) - 1, 0.975) * x.std(ddof=1) / math.sqrt(len(x)))
     found = (mean, mean - half, mean + half)
     if share:
-        return IntervalEstimate(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
-    return IntervalEstimate(*(math.exp(v) for v in found))
+        return EstimateWithLimits(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
+    return EstimateWithLimits(*(math.exp(v) for v in found))
 
 
-def _wilson_interval(successes: int, n: int) -> IntervalEstimate:
+def _wilson_interval(successes: int, n: int) -> EstimateWithLimits:
     p, z2 = successes / n, _NORMAL_QUANTILE_975**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _NORMAL_QUANTILE_975 / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return IntervalEstimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
+    return EstimateWithLimits(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 
 def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:

@@ -28,7 +28,7 @@ from drake_teleop.live.experiment.procedure import (
     Procedure,
 )
 from drake_teleop.live.experiment.store import TrialStore
-from drake_teleop.live.inputs import LENGTH_UNIT_M, SLICE_MS
+from drake_teleop.live.inputs import INPUT_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -37,7 +37,7 @@ from drake_teleop.station.station import MakeTeleopStation
 from drake_teleop.station.task_measures import contact_force, task_measures
 
 # Start of the hand's motion [s].
-_MOTION_START_S = 0.4
+_HAND_MOTION_START_S = 0.4
 _LOG_READ_PERIOD_MS = 200
 
 
@@ -74,7 +74,7 @@ def simulate_participant(
         if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                result = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _run_peg_insertion(apparatus, scenarios[procedure.trial.task], procedure)
             else:
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
@@ -83,13 +83,13 @@ def simulate_participant(
             procedure.start_second_interval()
         elif procedure.phase == ANSWER_PHASE:
             rng = np.random.default_rng([experiment.seed, participant, procedure.trial_number, 3])
-            procedure.store_answer(compare_responses(observer, responses, rng), 0.5)
+            procedure.store_answer(answer_by_larger_response(observer, responses, rng), 0.5)
             progress(procedure.trial_number, len(procedure.trials))
         else:
             procedure.advance_phase()
 
 
-def compare_responses(
+def answer_by_larger_response(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
     """Return the interval, 1 or 2, with the larger noisy response [N], or a guess (lapse)."""
@@ -106,30 +106,30 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.stimulus_inputs(procedure.current_level, procedure.expected_force)
+    stimulus = apparatus.stimulus_inputs(procedure.current_level, procedure.expected_contact_force)
     rows = IntervalLog(apparatus.scenario, None)
-    moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
+    moves_sideways, length = isinstance(task, ApparentMass), task.interval - _HAND_MOTION_START_S
     while session.ms < 1e3 * task.interval:
-        t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)
+        t = max(1e-3 * session.ms - _HAND_MOTION_START_S, 0.0)
         if moves_sideways:
             ramp = min(t, 1.0)
             displacement = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
         else:
             share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
             displacement = {"z": -observer.reach * share}
-        hand = {name: value / LENGTH_UNIT_M for name, value in displacement.items()}
+        hand = {name: value / INPUT_UNIT_M for name, value in displacement.items()}
         session.apply_inputs(session.inputs.with_changes(stimulus | hand))
         session.advance(SLICE_MS)
         if session.ms % _LOG_READ_PERIOD_MS == 0:
-            rows.add(session.new_rows())
-    rows.add(session.new_rows())
+            rows.add_rows(session.new_rows())
+    rows.add_rows(session.new_rows())
     session.close()
     return apparatus.interval_result(
         procedure.current_level, stimulus, rows
-    ), rows.largest_rendered_force_change(_MOTION_START_S)
+    ), rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:
+def _run_peg_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
     assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
     scenario = replace(

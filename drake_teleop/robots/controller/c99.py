@@ -27,7 +27,7 @@ CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 KERNEL_FILES = ("wrench_compensator.h", "wrench_compensator.c", "load.h")
 _TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
-_TEST_AMPLITUDES = np.repeat([1.0, 0.05], 3)
+_TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 
 Files = Mapping[str, str | bytes]
 
@@ -174,7 +174,7 @@ def _simulated_readings(target: ControllerTarget) -> tuple[Array, Array]:
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
     down = np.array([3.0, -4.0, -8.0]) + omega
     motion = 5.0 * alpha - down, omega, alpha
-    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_AMPLITUDES
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_WRENCH_AMPLITUDES
     wrench = non_contact_wrench(*motion, target.load.phi) + target.load.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
     largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)

@@ -22,7 +22,7 @@ from drake_teleop.robots.controller.c99 import (
 )
 
 _MODEL_NAME = "wrench_compensator"
-_WRENCH_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+_WRENCH_COMPONENT_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 _UNIT_EXPONENTS = {
     "N": {"kg": "1", "m": "1", "s": "-2"},
     "N.m": {"kg": "1", "m": "2", "s": "-2"},
@@ -33,7 +33,7 @@ _UNIT_EXPONENTS = {
     "kg.m": {"kg": "1", "m": "1"},
     "kg.m2": {"kg": "1", "m": "2"},
 }
-_PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
+_PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
 def fmu_files(target: ControllerTarget) -> Files:
@@ -68,7 +68,7 @@ def _fmu_archive(
             SubElement(group, "SourceFile", name=name)
         files["sources/buildDescription.xml"] = _indented_xml(build)
     if cc is not None:
-        binary = f"binaries/{_PLATFORMS[version]}/{_MODEL_NAME}.so"
+        binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
         files[binary] = _compile_library(cc, sources, compiled)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -130,11 +130,11 @@ def _model_description(
         SubElement(variables, "Float64", time | {"variability": "continuous"})
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
     structure = SubElement(root, "ModelStructure")
-    _add_unknowns(structure, outputs, new)
+    _add_output_unknowns(structure, outputs, new)
     return _indented_xml(root)
 
 
-def _add_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
+def _add_output_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:
@@ -145,7 +145,7 @@ def _add_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
 
 
 def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
-    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_NAMES]
+    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_COMPONENT_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
     found = target.make_compensator().c_settings
