@@ -16,7 +16,7 @@ from drake_teleop.logs.causes.instants import (
     block_means_of_record,
     delay_of_free_fit,
 )
-from drake_teleop.logs.causes.intervals import misfit_deviation_factor
+from drake_teleop.logs.causes.intervals import widening_factor_by_misfit
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
 from drake_teleop.logs.causes.state import UsedRows, fit_model, is_in_spans, regularized_inverse
 
@@ -98,7 +98,9 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     )
     assert not model.start_parameters(x, Model())[DELAY_INDEX + 1 :].any()
     other = model.with_extension("torque factor")
-    np.testing.assert_array_equal(other.start_parameters(x, model)[other.slices[name]], values)
+    np.testing.assert_array_equal(
+        other.start_parameters(x, model)[other.parameter_slices[name]], values
+    )
 
 
 def test_axes_factor_and_steps_change_the_wrench_as_stated():
@@ -236,4 +238,4 @@ def test_deviations_widen_with_the_scatter_of_parts_and_with_a_smooth_misfit(
         smooth_misfit=smooth,
         x=np.concatenate([OFFSETS, PHI]),
     )
-    assert misfit_deviation_factor(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)
+    assert widening_factor_by_misfit(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)

@@ -42,8 +42,8 @@ _NUM_EXTENSION_PARAMETERS = {
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP = slice(16, 25)
-_MAX_DELAY_STEP_S = 0.03  # s, in an iteration
-_ROTATION_STEP_RAD = 1e-4  # rad, step of the numerical derivative
+_MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03  # s, in an iteration
+_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 _SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -85,7 +85,7 @@ class Model:
         )
 
     @cached_property
-    def slices(self) -> dict[str, slice]:
+    def parameter_slices(self) -> dict[str, slice]:
         """Position of each extension's parameters in the parameter vector."""
         out, at = {}, DELAY_INDEX + 1
         sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
@@ -98,7 +98,7 @@ class Model:
 
     @property
     def size(self) -> int:
-        return max([DELAY_INDEX + 1, *(x.stop for x in self.slices.values())])
+        return max([DELAY_INDEX + 1, *(x.stop for x in self.parameter_slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
@@ -112,11 +112,11 @@ class Model:
         return np.flatnonzero(kept)
 
     @cached_property
-    def max_changes(self) -> Array:
+    def max_parameter_changes(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY_INDEX] = _MAX_DELAY_STEP_S
-        for name, where in self.slices.items():
+        out[DELAY_INDEX] = _MAX_DELAY_CHANGE_PER_ITERATION_S
+        for name, where in self.parameter_slices.items():
             out[where] = _MAX_CHANGE_PER_ITERATION.get(
                 name.split(" ")[0] if "gain" in name else name, np.inf
             )
@@ -130,14 +130,14 @@ class Model:
         """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
-        for name, where in self.slices.items():
-            if name in of.slices:
-                out[where] = x[of.slices[name]]
+        for name, where in self.parameter_slices.items():
+            if name in of.parameter_slices:
+                out[where] = x[of.parameter_slices[name]]
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
-        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
+        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.parameter_slices
         motion = self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
@@ -168,14 +168,14 @@ class Model:
         out[:, channels, WRENCH_RATE.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _columns_of_step(i).start] += x[:, self.slices[f"step {i}"]]
+                out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
-            if name in self.slices:
-                rows = x[:, self.slices[name]].reshape(-1, 6, degree)
+            if name in self.parameter_slices:
+                rows = x[:, self.parameter_slices[name]].reshape(-1, 6, degree)
                 out[:, :, TIME_POLYNOMIALS.start : TIME_POLYNOMIALS.start + degree] += rows
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
-        parts = self.slices
+        parts = self.parameter_slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
         for rows, where in (
@@ -195,15 +195,15 @@ class Model:
         return M
 
     def _sensor_rotations(self, x: Array) -> Array:
-        if "rotation" not in self.slices:
+        if "rotation" not in self.parameter_slices:
             return self.axes[None]
-        return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
+        return Rotation.from_rotvec(x[:, self.parameter_slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
         """Return the derivative (size, 6, k) of the coefficients of k signals by parameters x."""
         steps = np.ones(self.size)
-        if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _ROTATION_STEP_RAD
+        if "rotation" in self.parameter_slices:
+            steps[self.parameter_slices["rotation"]] = _ROTATION_DIFFERENCE_STEP_RAD
         moves = np.diag(steps)
         both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]

@@ -14,7 +14,7 @@ from drake_teleop.logs.causes.instants import (
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
     ROTATION,
-    SYMMETRIC_ENTRIES,
+    SYMMETRIC_MATRIX_ENTRIES,
     WRENCH,
     Instants,
 )
@@ -107,8 +107,8 @@ def is_in_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
     return inside
 
 
-_MAX_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
-_RIDGE, _NOISE_POWER_FLOOR = 1e-11, 1e-14
+_MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
+_RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,13 +146,13 @@ class ModelFit:
 
 
 def fit_model(
-    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_FIT_ITERATIONS
 ) -> ModelFit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, WRENCH] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
-    floor = np.maximum(_NOISE_POWER_FLOOR * both, 1e-30)
+    floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
     filters = np.zeros((6, MAX_NOISE_LAG + 1))
     filters[:, 0] = 1.0
     found = ModelFit(
@@ -168,14 +168,14 @@ def fit_model(
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
         move = inverse @ right
-        move /= max(1.0, float(np.max(np.abs(move) / model.max_changes)))
+        move /= max(1.0, float(np.max(np.abs(move) / model.max_parameter_changes)))
         x = x + move
         residual = model.residual_coefficients(x)
-        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else MAX_NOISE_LAG
+        order = 0 if step + 1 < _UNWEIGHTED_FIT_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
         found = ModelFit(model, rows, x, inverse, residual, filters, power)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
-        if still and step > _UNWEIGHTED_ITERATIONS:
+        if still and step > _UNWEIGHTED_FIT_ITERATIONS:
             break
     return found
 
@@ -184,9 +184,9 @@ def regularized_inverse(gram: Array) -> Array:
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
     scaled = gram * np.outer(scale, scale)
-    scaled[np.diag_indices(len(gram))] += _RIDGE
+    scaled[np.diag_indices(len(gram))] += _RIDGE_OF_SCALED_GRAM
     values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(values, _RIDGE)
+    values = np.maximum(values, _RIDGE_OF_SCALED_GRAM)
     return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
 
 
@@ -232,7 +232,7 @@ class State:
 
     def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
         """Return the parameters of a named extension of the model, and their covariance."""
-        where = self.model.slices[name]
+        where = self.model.parameter_slices[name]
         return self.x[where], self.fit.covariance[where, where]
 
     @property
@@ -273,7 +273,7 @@ class State:
             [
                 y[:, : OMEGA_PRODUCTS.stop],
                 y[:, ROTATION] if self.data.gravity_W is not None else y[:, :0],
-                y[:, R_P_PRODUCTS] @ _stiffness_signals().T
+                y[:, R_P_PRODUCTS] @ _cable_stiffness_signals().T
                 if self.data.has_positions
                 else y[:, :0],
                 part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
@@ -286,7 +286,7 @@ class State:
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = first_order_gain(x.T @ x, x.T @ white)
+            solved, rank = score_statistic(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
 
@@ -295,12 +295,12 @@ class State:
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
         residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
-        return first_order_gain(
+        return score_statistic(
             *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
         )[0]
 
 
-def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
@@ -314,9 +314,9 @@ def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> t
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _stiffness_signals() -> Array:
+def _cable_stiffness_signals() -> Array:
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(SYMMETRIC_ENTRIES):
+    for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0
