@@ -65,10 +65,10 @@ from drake_teleop.logs.read.reading import read_description
 # Episodes that determine load, lag and noise: fewer if they are long.
 _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_FRAMES = 12_000
-_MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
+_MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_EXCESS_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
-_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = 2, 20
+_MAX_UNEXPLAINED_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
@@ -216,7 +216,7 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
             where=f"{episode.file.name}: {episode.name}",
             remedy="give a --description, see docs/robot-learning.md",
         )
-    for _ in range(_MAX_CORRECTIONS):
+    for _ in range(_MAX_DRAFT_CORRECTIONS):
         described = _description_of_episode(streams, episode, dataset.fps)
         try:
             found = check_conventions(described, str(episode.file), {episode.file: table}).findings
@@ -350,7 +350,7 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         0
     ] - np.log(shared.usual_half_widths)
     spread -= np.log(found.gain).repeat(3)
-    if not faults and spread.mean() > _MAX_EXCESS_LOG_SPREAD:
+    if not faults and spread.mean() > _MAX_UNEXPLAINED_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
@@ -380,7 +380,7 @@ def _contact_wrench_and_flags(
         detector = ContactDetector(shared.noise_floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
         free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
-        if free.sum() < _MIN_FRAMES_FOR_OFFSETS:
+        if free.sum() < _MIN_FREE_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)
     return contact, touched
