@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.instants import (
-    WRENCH,
+    WRENCH_SIGNALS,
     Instants,
     block_means_of_record,
     delay_of_free_fit,
@@ -85,7 +85,7 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     y = data.append_step_signals(())
     np.testing.assert_allclose(
-        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, WRENCH].T, atol=1e-9
+        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, WRENCH_SIGNALS].T, atol=1e-9
     )
     left = model.residual_coefficients(x) @ y[:, model.columns].T
     np.testing.assert_allclose(left, 0.0, atol=1e-9)
@@ -117,7 +117,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     rng = np.random.default_rng(0)
     data = record(rng.normal(size=(len(T), 6)))
     found = data.append_step_signals(model.step_times) @ model.wrench_coefficients(x[None])[0].T
-    rates = np.gradient(data.y[:, WRENCH], 0.02, axis=0)
+    rates = np.gradient(data.y[:, WRENCH_SIGNALS], 0.02, axis=0)
     inside = slice(2, -2)
     np.testing.assert_allclose(found[inside], (expected + 0.02 * rates)[inside], atol=1e-9)
 
@@ -204,7 +204,7 @@ def test_instants_are_block_means(size):
     np.testing.assert_array_equal(np.flatnonzero(~data.used), [0, 50, 119, 199])
     np.testing.assert_allclose(data.t, t.reshape(200, size).mean(axis=1))
     means = noise.reshape(200, size, 6).mean(axis=1)
-    np.testing.assert_allclose(data.y[data.used][:, WRENCH], means[data.used])
+    np.testing.assert_allclose(data.y[data.used][:, WRENCH_SIGNALS], means[data.used])
     np.testing.assert_allclose(
         data.wrench_noise * np.sqrt(size), np.repeat([0.4, 0.03], 3), rtol=0.25
     )

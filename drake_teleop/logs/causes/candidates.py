@@ -13,10 +13,10 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.changes import add_step, find_contact_spans
 from drake_teleop.logs.causes.instants import (
     CONSTANT_COLUMN,
-    GRAVITY,
-    ROTATION,
-    SPECIFIC_FORCE,
-    WRENCH,
+    GRAVITY_SIGNALS,
+    ROTATION_SIGNALS,
+    SPECIFIC_FORCE_SIGNALS,
+    WRENCH_SIGNALS,
 )
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
@@ -199,9 +199,9 @@ def start_parameters_of_tilt_fit(state: State) -> Array | None:
     J = np.zeros((7, 3, width))
     for i in range(3):
         J[i, i, CONSTANT_COLUMN] = 1.0
-        J[3, i, SPECIFIC_FORCE.start + i] = J[3, i, GRAVITY.start + i] = 1.0
-        J[4:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = np.eye(3)
-    force = np.eye(width)[WRENCH][:3]
+        J[3, i, SPECIFIC_FORCE_SIGNALS.start + i] = J[3, i, GRAVITY_SIGNALS.start + i] = 1.0
+        J[4:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = np.eye(3)
+    force = np.eye(width)[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
     found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
@@ -289,10 +289,10 @@ def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
     if "weight" in model.extensions:
         used.append(model.parameter_slices["weight"].start)
     J = model.wrench_derivative(np.zeros(model.size))[used, :3]
-    force = np.eye(len(sums))[WRENCH][:3]
+    force = np.eye(len(sums))[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
-    total = float(np.trace(sums[WRENCH, WRENCH][:3, :3]))
+    total = float(np.trace(sums[WRENCH_SIGNALS, WRENCH_SIGNALS][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
     best: tuple[float, Array] = (np.inf, np.eye(3))
     plain = total

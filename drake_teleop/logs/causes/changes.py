@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
-from drake_teleop.logs.causes.instants import WRENCH
+from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
 from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
     State,
@@ -277,7 +277,7 @@ class _ResidualBlocks:
         self._counts = sums[:, 0, 0]
         self.usable = self._counts > 0.5 * data.rows_per_block
         J = state.model.wrench_derivative(state.x)
-        sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH] / max(self._counts.sum(), 1.0))
+        sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH_SIGNALS] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.wrench_noise, least)
         self._gram = np.zeros((len(sums), len(J), len(J)))

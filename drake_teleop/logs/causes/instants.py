@@ -22,13 +22,13 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
 CONSTANT_COLUMN = 0
-SPECIFIC_FORCE = slice(1, 4)
-GRAVITY = slice(4, 7)
-ALPHA = slice(7, 10)
+SPECIFIC_FORCE_SIGNALS = slice(1, 4)
+GRAVITY_SIGNALS = slice(4, 7)
+ALPHA_SIGNALS = slice(7, 10)
 OMEGA_PRODUCTS = slice(10, 16)
-WRENCH = slice(16, 22)
-WRENCH_RATE = slice(22, 28)
-ROTATION = slice(28, 37)
+WRENCH_SIGNALS = slice(16, 22)
+WRENCH_RATE_SIGNALS = slice(22, 28)
+ROTATION_SIGNALS = slice(28, 37)
 R_P_PRODUCTS = slice(37, 64)
 TIME_POLYNOMIALS = slice(64, 67)
 NUM_SIGNALS = 67
@@ -77,7 +77,7 @@ class Instants:
         """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
-        a = (self.y[:, SPECIFIC_FORCE] + self.y[:, GRAVITY])[self.used]
+        a = (self.y[:, SPECIFIC_FORCE_SIGNALS] + self.y[:, GRAVITY_SIGNALS])[self.used]
         return bool(
             np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_OVER_NOISE * self.acceleration_noise
         )
@@ -139,8 +139,10 @@ def block_means_of_record(
     middle = t.reshape(rows, size).mean(axis=1)
     y = np.zeros((rows, NUM_SIGNALS))
     y[:, CONSTANT_COLUMN] = 1.0
-    y[:, WRENCH] = wrench.reshape(rows, size, 6).mean(axis=1)
-    y[1:-1, WRENCH_RATE] = (y[2:, WRENCH] - y[:-2, WRENCH]) / (2.0 * size * dt)
+    y[:, WRENCH_SIGNALS] = wrench.reshape(rows, size, 6).mean(axis=1)
+    y[1:-1, WRENCH_RATE_SIGNALS] = (y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]) / (
+        2.0 * size * dt
+    )
     positions = _write_motion_signals(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
     # Legendre polynomials.
@@ -163,13 +165,13 @@ def block_means_of_record(
 def _smooth_noisy_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
-    alpha = y[used][:, ALPHA]
+    alpha = y[used][:, ALPHA_SIGNALS]
     share = _smallest_noise_variance_share(alpha)
     for width in _ALPHA_SMOOTHING_WIDTHS_ROWS:
         if _smallest_noise_variance_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
-        alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
-    y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
+        alpha = savgol_filter(y[used][:, ALPHA_SIGNALS], width, 2, axis=0)
+    y[np.flatnonzero(used)[:, None], np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop)] = alpha
     return share
 
 
@@ -212,7 +214,7 @@ def _write_motion_signals(
 
 def _write_signal_columns(y: Array, columns: Array) -> None:
     y[:, 1:16] = columns[:, :15]
-    y[:, ROTATION.start : ROTATION.start + columns.shape[1] - 15] = columns[:, 15:]
+    y[:, ROTATION_SIGNALS.start : ROTATION_SIGNALS.start + columns.shape[1] - 15] = columns[:, 15:]
 
 
 def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
@@ -235,7 +237,7 @@ def delay_of_free_fit(data: Instants) -> float:
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
     spline = CubicSpline(data.t, data.y[:, _LOAD_SIGNAL_COLUMNS])
-    forces = data.y[rows][:, WRENCH]
+    forces = data.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 
     def log_residual(shift: float) -> float:

@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
-from drake_teleop.logs.causes.instants import ALPHA, WRENCH, white_noise_deviations
+from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS, white_noise_deviations
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
 from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
@@ -82,7 +82,9 @@ def load_covariance_by_gain_errors(state: State) -> Array:
     weights = rows.whitened_products(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
-    wrench = (rows.columns == np.arange(WRENCH.start, WRENCH.stop)[:, None]) - fit.residual
+    wrench = (
+        rows.columns == np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)[:, None]
+    ) - fit.residual
     J, inverse = state.model.wrench_derivative(state.x), fit.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
@@ -123,8 +125,8 @@ def load_covariance_by_torque_unit(state: State) -> Array:
 def load_bias_by_alpha_noise(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
-    at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
-    variance = white_noise_deviations(data.y[data.used][:, ALPHA]) ** 2
+    at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))
+    variance = white_noise_deviations(data.y[data.used][:, ALPHA_SIGNALS]) ** 2
     weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
     J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)

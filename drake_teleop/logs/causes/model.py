@@ -13,18 +13,18 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
-    ALPHA,
+    ALPHA_SIGNALS,
     CONSTANT_COLUMN,
-    GRAVITY,
+    GRAVITY_SIGNALS,
     MOTION_COLUMNS,
     NUM_SIGNALS,
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
-    ROTATION,
-    SPECIFIC_FORCE,
+    ROTATION_SIGNALS,
+    SPECIFIC_FORCE_SIGNALS,
     TIME_POLYNOMIALS,
-    WRENCH,
-    WRENCH_RATE,
+    WRENCH_RATE_SIGNALS,
+    WRENCH_SIGNALS,
 )
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16
@@ -106,7 +106,7 @@ class Model:
         wide = bool({"gravity", "cable"} & set(self.extensions))
         kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
-            kept[ROTATION], kept[R_P_PRODUCTS] = False, False
+            kept[ROTATION_SIGNALS], kept[R_P_PRODUCTS] = False, False
             for i in range(len(self.steps)):
                 kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
         return np.flatnonzero(kept)
@@ -148,7 +148,7 @@ class Model:
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
-            out[..., GRAVITY] += static  # - V(-g) w
+            out[..., GRAVITY_SIGNALS] += static  # - V(-g) w
         if "cable" in parts:
             out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
         turned = self._sensor_rotations(x)
@@ -165,7 +165,7 @@ class Model:
     def _add_constant_extensions(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, CONSTANT_COLUMN] += x[:, :6]
-        out[:, channels, WRENCH_RATE.start + channels] += x[:, DELAY_INDEX, None]
+        out[:, channels, WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
                 out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
@@ -179,18 +179,18 @@ class Model:
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
         for rows, where in (
-            (slice(0, 3), SPECIFIC_FORCE),
-            (slice(3, 6), ALPHA),
+            (slice(0, 3), SPECIFIC_FORCE_SIGNALS),
+            (slice(3, 6), ALPHA_SIGNALS),
             (slice(6, 12), OMEGA_PRODUCTS),
         ):
             M[:, rows, where] = np.eye(rows.stop - rows.start)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):
-                M[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] += d
+                M[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
-            M[:, :3, ALPHA] -= cross_matrix(r)
+            M[:, :3, ALPHA_SIGNALS] -= cross_matrix(r)
             M[:, :3, OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
 
@@ -212,7 +212,7 @@ class Model:
     def residual_coefficients(self, x: Array) -> Array:
         """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
-        out[np.arange(6), WRENCH.start + np.arange(6)] += 1.0
+        out[np.arange(6), WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
@@ -228,7 +228,7 @@ def _cable_coefficients(x: Array) -> Array:
     out = np.zeros((len(x), 6, NUM_SIGNALS))
     K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
     for i in range(3):
-        out[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = x[:, :3]
+        out[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = x[:, :3]
         out[:, i, R_P_PRODUCTS.start + 9 * i : R_P_PRODUCTS.start + 9 * i + 9] = K.reshape(-1, 9)
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

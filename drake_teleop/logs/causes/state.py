@@ -13,9 +13,9 @@ from drake_teleop.logs.causes.instants import (
     MAX_NOISE_LAG,
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
-    ROTATION,
+    ROTATION_SIGNALS,
     SYMMETRIC_MATRIX_ENTRIES,
-    WRENCH,
+    WRENCH_SIGNALS,
     Instants,
 )
 from drake_teleop.logs.causes.model import Model
@@ -150,7 +150,7 @@ def fit_model(
 ) -> ModelFit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
-    total = (rows.data.y[rows.used][:, WRENCH] ** 2).sum(axis=0) / count
+    total = (rows.data.y[rows.used][:, WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
     filters = np.zeros((6, MAX_NOISE_LAG + 1))
@@ -272,7 +272,7 @@ class State:
         columns = np.hstack(
             [
                 y[:, : OMEGA_PRODUCTS.stop],
-                y[:, ROTATION] if self.data.gravity_W is not None else y[:, :0],
+                y[:, ROTATION_SIGNALS] if self.data.gravity_W is not None else y[:, :0],
                 y[:, R_P_PRODUCTS] @ _cable_stiffness_signals().T
                 if self.data.has_positions
                 else y[:, :0],

@@ -57,20 +57,20 @@ class LoadFit:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
-        unexplained, noise: shares of the wrench's variance: unexplained, and white noise.
+        unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
         mass: fitted mass [kg].
         independent: number of independent samples.
     """
 
     unexplained: float
     mass: float
-    noise: float = 0.0
+    noise_share: float = 0.0
     independent_samples: float = 1e9
 
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise_share
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
@@ -98,9 +98,9 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
         return LoadFit(unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
-    noise = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
+    noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
     independent_samples = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
-    return LoadFit(unexplained, float(theta[0]), noise, independent_samples)
+    return LoadFit(unexplained, float(theta[0]), noise_share, independent_samples)
 
 
 def _fit_load_parameters(V: Array, w: Array) -> Array:
@@ -202,7 +202,7 @@ def _edits_with_far_better_fit(
             negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = (
-        VALID_UNEXPLAINED + given.noise,
+        VALID_UNEXPLAINED + given.noise_share,
         given.unexplained / min_unexplained_reduction_by_edit(given),
     )
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
@@ -244,13 +244,13 @@ def _findings_without_remedy(
     smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
-    finding = undetermined_payload_finding(load, given.unexplained - given.noise)
+    finding = undetermined_payload_finding(load, given.unexplained - given.noise_share)
     if finding:
         return [finding], None
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise_share:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.

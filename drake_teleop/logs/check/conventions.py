@@ -213,7 +213,7 @@ def _merge_clock_findings(
     delay: float | None,
 ) -> list[Finding]:
     clocks = [finding for finding in findings if finding.name == "clock"]
-    if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
+    if len(clocks) < 2 or mounting is None or mounting.clock_drift or delay is None:
         return findings
     if abs(mounting.lag_s + delay) > MIN_CLOCK_ERROR_S:
         return findings

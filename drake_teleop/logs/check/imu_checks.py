@@ -225,7 +225,7 @@ def check_imu_against_pose(
             description, given = best[2], best[3]
     if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
-    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
+    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
@@ -262,7 +262,7 @@ def check_imu_against_pose(
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
     assert description.imu is not None and description.wrench is not None
     time = description.imu.time
-    if not found.drift:
+    if not found.clock_drift:
         offset = time.offset - found.lag_s
         finding = Finding(
             "clock",
@@ -273,14 +273,14 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
     start = data.start_time_of_stream(description.imu, description) - data.start_time_of_stream(
         description.wrench, description
     )
-    scale = 1 / (1 + found.drift)
-    lag = scale * (found.mid_record_lag_s + found.drift * (start - found.mid_record_time_s))
+    scale = 1 / (1 + found.clock_drift)
+    lag = scale * (found.mid_record_lag_s + found.clock_drift * (start - found.mid_record_time_s))
     offset, factor = time.offset - lag, scale * time.scale
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
-        f" {1e3 * found.drift:.3g} ms more each second ({found.lag_s:.3f} s is the best constant);"
-        f" set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
+        f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
+        f" constant); set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
     )
     edited = edit_field(description, "imu.time.offset", offset)
     return finding, edit_field(edited, "imu.time.scale", factor)

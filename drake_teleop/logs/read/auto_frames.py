@@ -105,7 +105,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
 def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     lever = None
     if mounting is not None and mounting.fits_pose:
-        lever = mounting.lever
+        lever = mounting.lever_arm
     if lever is None or not lever.is_determined_by_axis.all():
         other = lever_arm_from_wrench(at_Io)
         if lever is None or (

@@ -279,26 +279,26 @@ class Mounting:
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
         mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
             [s].
-        drift: growth of the lag [s/s]; 0 if insignificant.
+        clock_drift: growth of the lag [s/s]; 0 if insignificant.
         unexplained, unexplained_omega: unexplained shares of the variance of specific
             force and angular velocity (None without a gyroscope).
         is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
-        lever: position of the accelerometer; None without positions.
+        lever_arm: position of the accelerometer; None without positions.
     """
 
     R_SI: Array
     lag_s: float
     mid_record_lag_s: float
     mid_record_time_s: float
-    drift: float
+    clock_drift: float
     unexplained: float
     unexplained_omega: float | None
     is_mirrored: bool
     speed_ratio: float | None
     deviations_deg: Array
-    lever: LeverArm | None
+    lever_arm: LeverArm | None
 
     @property
     def rotation_angle_deg(self) -> float:
@@ -324,7 +324,7 @@ class Mounting:
         omega_agrees = (
             self.unexplained_omega is None or self.unexplained_omega < MAX_UNEXPLAINED_SHARE
         )
-        if self.lever is not None:
+        if self.lever_arm is not None:
             return (
                 not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
             )
@@ -391,13 +391,13 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         lag_s=lag if drift else float(x[3]),
         mid_record_lag_s=float(x[3]),
         mid_record_time_s=centre,
-        drift=drift,
+        clock_drift=drift,
         unexplained=shares[0],
         unexplained_omega=shares[1] if len(shares) > 1 else None,
         is_mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
-        lever=lever,
+        lever_arm=lever,
     )
 
 
