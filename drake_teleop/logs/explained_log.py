@@ -295,7 +295,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         if why.explained or not load.identifiable.any():
             return load
         stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
+        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_DEVIATION_RATIO:
             return load

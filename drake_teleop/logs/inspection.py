@@ -133,7 +133,7 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         finding = next((finding for finding in found if finding.fields), None)
         if finding is None:
             break
-        draft = draft.corrected(finding)
+        draft = draft.with_finding_corrected(finding)
         write_text(path, draft.text())
     return draft
 

@@ -26,7 +26,7 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     fit, data = SimpleNamespace(covariance=covariance), record(np.zeros((len(T), 6)))
-    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, spans=spans)
+    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, contact_spans=spans)
     state.parameters_of_extension = partial(State.parameters_of_extension, state)
     return state
 
@@ -155,7 +155,7 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
     state = State.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
     found = fit_with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
-    assert found.spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
+    assert found.contact_spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
     assert found.model.steps[0].time == 100.99
     for k, kind in enumerate(kinds, start=1):
@@ -187,7 +187,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
     gain = 2.0 * (contact.state.likelihood - state.likelihood)
-    assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
+    assert contact.name == "contact" and contact.state.contact_spans == ((found_start, found_stop),)
     assert contact.score == pytest.approx(gain - price)
 
 

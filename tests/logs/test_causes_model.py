@@ -18,7 +18,12 @@ from drake_teleop.logs.causes.instants import (
 )
 from drake_teleop.logs.causes.intervals import widening_factor_by_misfit
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
-from drake_teleop.logs.causes.state import UsedRows, fit_model, is_in_spans, regularized_inverse
+from drake_teleop.logs.causes.state import (
+    UsedRows,
+    fit_model,
+    is_in_time_spans,
+    regularized_inverse,
+)
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])
@@ -171,8 +176,8 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
     deviations = np.sqrt(np.diag(found.covariance))
     assert np.abs(error / deviations).max() < 4.0
     assert np.linalg.norm(error[DELAY_INDEX + 1 :]) < 0.05 * np.linalg.norm(values)
-    np.testing.assert_allclose(found.filters[:, 1], -0.7, atol=0.25)
-    np.testing.assert_allclose(np.sqrt(found.power) / white, 1.0, atol=0.25)
+    np.testing.assert_allclose(found.noise_filters[:, 1], -0.7, atol=0.25)
+    np.testing.assert_allclose(np.sqrt(found.noise_power) / white, 1.0, atol=0.25)
 
 
 def test_inverse_has_large_values_only_for_undetermined_parameters():
@@ -215,7 +220,7 @@ def test_instants_are_block_means(size):
 
 def test_rows_within_spans_are_marked():
     data = record(np.zeros((len(T), 6)))
-    inside = is_in_spans(data, ((101.0, 101.5), (103.0, 103.0)))
+    inside = is_in_time_spans(data, ((101.0, 101.5), (103.0, 103.0)))
     np.testing.assert_allclose(data.t[inside], [*np.arange(101.0, 101.51, 0.02), 103.0])
 
 

@@ -107,7 +107,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
         )
     spans = find_contact_spans(state)
-    if spans and spans != state.spans:
+    if spans and spans != state.contact_spans:
         larger = State.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)

@@ -79,7 +79,9 @@ def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cau
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
     changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
-    contacts = [span for span in state.spans if not _is_hand_contact(span, model.step_times)]
+    contacts = [
+        span for span in state.contact_spans if not _is_hand_contact(span, model.step_times)
+    ]
     changes += [_contact_cause(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 

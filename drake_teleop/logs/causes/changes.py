@@ -15,7 +15,7 @@ from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
     State,
     TimeSpans,
-    is_in_spans,
+    is_in_time_spans,
     regularized_inverse,
     score_statistic,
 )
@@ -40,7 +40,7 @@ def add_step(state: State, kind: str) -> State | None:
     best: State | None = None
     for time in _likely_step_times(state, kind):
         found = _refine_step_time(state, kind, time)
-        ramp = fit_with_ramps(state, [[kind]], [time], state.spans)
+        ramp = fit_with_ramps(state, [[kind]], [time], state.contact_spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
@@ -125,7 +125,7 @@ def fit_with_ramps(
     middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
-    return State.fit_record(state.data, model, found.x, found.spans)
+    return State.fit_record(state.data, model, found.x, found.contact_spans)
 
 
 def remove_small_steps(state: State) -> State:
@@ -138,7 +138,7 @@ def remove_small_steps(state: State) -> State:
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
         x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
-        state = State.fit_record(state.data, model, x, state.spans)
+        state = State.fit_record(state.data, model, x, state.contact_spans)
 
 
 def _squared_step_over_variance(state: State, i: int) -> float:
@@ -152,7 +152,7 @@ def _estimate_ramp_middle(
 ) -> float:
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
-    rows = np.flatnonzero(data.used & is_in_spans(data, (span,)))
+    rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
@@ -391,9 +391,9 @@ def replace_steps_by_contact(state: State) -> State:
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
-            return State.fit_record(state.data, model, x, (*state.spans, span))
+            return State.fit_record(state.data, model, x, (*state.contact_spans, span))
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
-            calm = State.fit_record(state.data, model, x, (*state.spans, span))
+            calm = State.fit_record(state.data, model, x, (*state.contact_spans, span))
             if calm.residual_ratio < min(
                 _CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM
             ):
@@ -404,7 +404,7 @@ def replace_steps_by_contact(state: State) -> State:
 def shrink_contacts(state: State) -> State:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
-    spans = [_shrunk_contact_span(state, span) for span in state.spans]
+    spans = [_shrunk_contact_span(state, span) for span in state.contact_spans]
     return State.fit_record(
         state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
     )
@@ -412,7 +412,7 @@ def shrink_contacts(state: State) -> State:
 
 def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
     data = state.data
-    inside = np.flatnonzero(data.used & is_in_spans(data, (span,)))
+    inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
     usual = np.maximum(
         np.maximum(data.wrench_noise, state.rows.residual_rms(state.fit.residual)), 1e-12
@@ -426,7 +426,7 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
 
 
 def _median_residual_over_noise(state: State, span: tuple[float, float]) -> float:
-    chosen = state.rows.used & is_in_spans(state.data, (span,))
+    chosen = state.rows.used & is_in_time_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
     e = np.abs(state.rows.y[chosen] @ state.fit.residual.T)

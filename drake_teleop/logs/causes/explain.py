@@ -47,7 +47,7 @@ _MAX_CORRECTED_DELAY_S = 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
 _MAX_DELAY_ITERATIONS = 4
 MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
-"""Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
+"""Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MAX_CONTACT_RESIDUAL_SHARE = 0.5
 _MUCH_SMALLER_RESIDUAL = 0.2
@@ -80,7 +80,7 @@ def residual_is_noise(state: State) -> bool:
         for c in range(6)
         if c not in model.gain_channels
     ]
-    return all(state.score(x) < MAX_NOISE_EXTENSION_SCORE for x in larger)
+    return all(state.score_of_larger_model(x) < MAX_NOISE_EXTENSION_SCORE for x in larger)
 
 
 SearchResult = tuple[State, float, list[Candidate]]
@@ -171,7 +171,7 @@ def _search_causes_from(
         larger = replace_steps_by_contact(winner.state)
         if winner.name == "contact":
             larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
-        elif larger.spans != winner.state.spans:
+        elif larger.contact_spans != winner.state.contact_spans:
             larger = replace_contacts_by_steps(larger) or larger
         state, delay_s = _apply_fitted_delay(larger, delay_s, with_delay)
         rejected = [x for x in rejected if x is not winner]
@@ -200,7 +200,7 @@ def _apply_fitted_delay(
         delay_s += float(state.x[DELAY_INDEX])
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
-        state = State.fit_record(with_delay(delay_s), state.model, x, state.spans)
+        state = State.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
     return state, delay_s
 
 
@@ -274,7 +274,7 @@ class Explanation:
     Attributes:
         explained: whether the residual is sensor noise.
         theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
-        deviations: (16,) standard deviations of theta due to the misfit.
+        misfit_deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
@@ -285,7 +285,7 @@ class Explanation:
     explained: bool
     theta: Array
     covariance: Array
-    deviations: Array
+    misfit_deviations: Array
     delay_s: float
     loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
@@ -333,7 +333,7 @@ def explain_misfit(
             explained=only_noise,
             theta=state.x[OFFSETS_AND_LOAD],
             covariance=covariance,
-            deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
+            misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(loads_between_changes(state, covariance)),
             removed_weight=removed,

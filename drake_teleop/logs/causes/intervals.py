@@ -79,7 +79,7 @@ def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -
 def load_covariance_by_gain_errors(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
-    weights = rows.whitened_products(fit.filters) / fit.power[:, None, None]
+    weights = rows.whitened_products(fit.noise_filters) / fit.noise_power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (
@@ -127,7 +127,7 @@ def load_bias_by_alpha_noise(state: State) -> Array:
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))
     variance = white_noise_deviations(data.y[data.used][:, ALPHA_SIGNALS]) ** 2
-    weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
+    weights = state.rows.used.sum() * (fit.noise_filters**2).sum(axis=1) / fit.noise_power
     J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
     return np.asarray((fit.covariance @ right)[OFFSETS_AND_LOAD])

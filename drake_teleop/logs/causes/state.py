@@ -100,7 +100,7 @@ class UsedRows:
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def is_in_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
+def is_in_time_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
@@ -118,8 +118,8 @@ class ModelFit:
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
         residual: (6, W) coefficients of the residual in the signals y.
-        filters: (6, 5) filters that whiten the residual e: sum over d of filters[c, d] e_c[n - d].
-        power: (6,) variance of the whitened residual.
+        noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
+        noise_power: (6,) variance of the whitened residual.
     """
 
     model: Model
@@ -127,17 +127,17 @@ class ModelFit:
     x: Array
     covariance: Array
     residual: Array
-    filters: Array
-    power: Array
+    noise_filters: Array
+    noise_power: Array
 
     @property
     def likelihood(self) -> float:
         """Logarithm of the likelihood up to a constant."""
-        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.power).sum())
+        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.noise_power).sum())
 
     def normal_equations(self, model: Model, x: Array) -> tuple[Array, Array]:
         """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
-        whitened = self.rows.whitened_products(self.filters) / self.power[:, None, None]
+        whitened = self.rows.whitened_products(self.noise_filters) / self.noise_power[:, None, None]
         J = model.wrench_derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
         gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
@@ -195,17 +195,17 @@ _NUM_SMOOTH_SEGMENTS = 6
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Model fitted to the rows of a record outside of contacts (`spans`: start, stop [s])."""
+    """Model fitted to the rows of a record outside of `contact_spans` (start, stop) [s]."""
 
     data: Instants
-    spans: TimeSpans
+    contact_spans: TimeSpans
     fit: ModelFit
 
     @classmethod
     def fit_record(
         cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
     ) -> State:
-        used = data.used & ~is_in_spans(data, spans)
+        used = data.used & ~is_in_time_spans(data, spans)
         rows = UsedRows(data, used, model.step_times, model.columns)
         return cls(data, spans, fit_model(model, rows, start))
 
@@ -213,7 +213,9 @@ class State:
         if start is None:
             start = model.start_parameters(self.x, self.model)
         return State(
-            self.data, self.spans, fit_model(model, self._rows_for_model(model), start, **options)
+            self.data,
+            self.contact_spans,
+            fit_model(model, self._rows_for_model(model), start, **options),
         )
 
     def _rows_for_model(self, model: Model) -> UsedRows:
@@ -242,11 +244,11 @@ class State:
     @cached_property
     def likelihood(self) -> float:
         """Logarithm of the likelihood of all rows; contacts have separate noise."""
-        if not self.spans:
+        if not self.contact_spans:
             return self.fit.likelihood
         used = self.data.used & ~self.rows.used
         inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
-        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
+        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.noise_power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
         every = UsedRows(self.data, self.data.used, (), self.model.columns)
         count = len(every.rows_with_predecessors) - len(self.rows.rows_with_predecessors)
@@ -280,17 +282,17 @@ class State:
             ]
         )
         e = self.rows.y @ self.fit.residual.T
-        whole, filters = self.rows.rows_with_predecessors, self.fit.filters
+        whole, filters = self.rows.rows_with_predecessors, self.fit.noise_filters
         gain, freedom = 0.0, 0
         late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
             solved, rank = score_statistic(x.T @ x, x.T @ white)
-            gain, freedom = gain + solved / self.fit.power[c], freedom + rank
+            gain, freedom = gain + solved / self.fit.noise_power[c], freedom + rank
         return gain, freedom
 
-    def score(self, model: Model) -> float:
+    def score_of_larger_model(self, model: Model) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)

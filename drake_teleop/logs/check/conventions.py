@@ -102,7 +102,7 @@ def check_suspicious_load(
     negative = load.mass < 0 and bool(load.identifiable[6])
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
     if worthless and not log.static:
-        _require_motion(log)
+        _require_enough_motion(log)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
         if not negative:
@@ -129,7 +129,7 @@ def _findings_except_lag(check: Callable[[], Conventions]) -> list[Finding]:
     return []
 
 
-def _require_motion(log: Log) -> None:
+def _require_enough_motion(log: Log) -> None:
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
     if s < _MIN_ACCELERATION_AND_SPEED_RMS[0] and omega < _MIN_ACCELERATION_AND_SPEED_RMS[1]:
         seconds = log.t[-1] - log.t[0]

@@ -98,15 +98,15 @@ _NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {r
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, and its comment lines (`head`)."""
+    """Draft of a log description: its streams as in YAML, and its comment lines."""
 
     streams: dict[str, Any]
-    head: list[str]
+    comment_lines: list[str]
 
     def text(self) -> str:
-        return to_yaml_text(self.streams, head=self.head)
+        return to_yaml_text(self.streams, head=self.comment_lines)
 
-    def corrected(self, finding: Finding) -> Draft:
+    def with_finding_corrected(self, finding: Finding) -> Draft:
         streams = copy.deepcopy(self.streams)
         for path, value in finding.fields.items():
             *outer, last = path.split(".")
@@ -114,7 +114,7 @@ class Draft(NamedTuple):
             for name in outer:
                 place = place.setdefault(name, {})
             place[last] = value
-        return Draft(streams, [*self.head, f"Corrected by the data: {finding.message}."])
+        return Draft(streams, [*self.comment_lines, f"Corrected by the data: {finding.message}."])
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
@@ -124,7 +124,7 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
-    lines = dict.fromkeys(line for draft in drafts for line in draft.head)
+    lines = dict.fromkeys(line for draft in drafts for line in draft.comment_lines)
     return Draft(
         {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}, list(lines)
     )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
 _ACCELERATION_CUTOFF_HZ = 3.0
-_MAX_CONDITION_NUMBER = 1e8
+_MAX_SHIFT_FIT_CONDITION_NUMBER = 1e8
 _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
 _MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
@@ -120,7 +120,7 @@ def _fit_centred_signals(
     if (size == 0.0).any():
         return None
     gram = (A / size).T @ (A / size)
-    if np.linalg.cond(gram) > _MAX_CONDITION_NUMBER:
+    if np.linalg.cond(gram) > _MAX_SHIFT_FIT_CONDITION_NUMBER:
         return None
     inverse = np.linalg.inv(gram)
     x = inverse @ ((A / size).T @ b)

@@ -77,7 +77,7 @@ class EpisodeTask(NamedTuple):
 
     dataset: Dataset
     streams: dict[str, Any]
-    shared: SharedLoad
+    shared_load: SharedLoad
 
 
 def dataset_command(
@@ -119,7 +119,7 @@ def dataset_command(
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
         task = EpisodeTask(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
-        columns = [_read_new_columns(work / f"{k}.npy") for k in range(len(rows))]
+        columns = [_read_judged_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
@@ -225,7 +225,7 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
         fields = next((x for x in found if x.fields and "time" not in str(x.fields)), None)
         if fields is None:
             break
-        draft = draft.corrected(fields)
+        draft = draft.with_finding_corrected(fields)
         streams = _remove_file_names(draft, dataset.fps)
     return streams
 
@@ -322,13 +322,13 @@ def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
     write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
 
 
-def _read_new_columns(path: Path) -> NewColumns:
+def _read_judged_columns(path: Path) -> NewColumns:
     values = np.load(path, allow_pickle=False)
     return NewColumns(values[:, :6], values[:, 6] > 0.5)
 
 
 def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
-    shared = task.shared
+    shared = task.shared_load
     log, at = _read_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
     predict = signals.reading_predictor(shared.phi)
