@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record
-from drake_teleop.logs.causes.intervals import attenuation_bias
+from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
@@ -282,7 +282,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     load = _load_with_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load
-    extra = attenuation_bias(why.state)
+    extra = load_bias_by_alpha_noise(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     covariance = load.covariance + np.diag(extra**2)
@@ -295,7 +295,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         if why.explained or not load.identifiable.any():
             return load
         stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
+        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_DEVIATION_RATIO:
             return load

@@ -133,7 +133,7 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         finding = next((finding for finding in found if finding.fields), None)
         if finding is None:
             break
-        draft = draft.corrected(finding)
+        draft = draft.with_finding_corrected(finding)
         write_text(path, draft.text())
     return draft
 
@@ -166,7 +166,7 @@ def _inspect_described_log(
                 "angle_deg": found.mounting.rotation_angle_deg,
                 "right_angled": found.mounting.is_right_angled,
                 "lag_s": found.mounting.lag_s,
-                "drift": found.mounting.drift,
+                "drift": found.mounting.clock_drift,
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]

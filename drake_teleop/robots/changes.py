@@ -16,7 +16,7 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Cause, causes_of_fit
 from drake_teleop.logs.causes.explain import explain_misfit
-from drake_teleop.logs.causes.instants import SPECIFIC_FORCE, block_means_of_record
+from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
@@ -140,7 +140,7 @@ def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
 
 def _is_change_kind_certain(state: State, time: float) -> bool:
     steps, data = state.model.steps, state.data
-    after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE]
+    after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE_SIGNALS]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE:
         return False
     own = next(step for step in steps if step.time == time)

@@ -17,7 +17,7 @@ from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
 from drake_teleop.logs.causes.explain import _apply_fitted_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
-from drake_teleop.logs.causes.state import State, first_order_gain
+from drake_teleop.logs.causes.state import State, score_statistic
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -26,7 +26,7 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     fit, data = SimpleNamespace(covariance=covariance), record(np.zeros((len(T), 6)))
-    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, spans=spans)
+    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, contact_spans=spans)
     state.parameters_of_extension = partial(State.parameters_of_extension, state)
     return state
 
@@ -133,10 +133,10 @@ def test_gain_of_smooth_signals_counts_independent_ones(scale):
     rng = np.random.default_rng(0)
     A, e = rng.normal(size=(30, 4)) * [1.0, scale, 1e-3, 2.0], rng.normal(size=30)
     for columns, rank in ((A, 4), (np.column_stack([A, A[:, 0] + A[:, 3], 0.0 * e]), 4)):
-        gain, found = first_order_gain(columns.T @ columns, columns.T @ e)
+        gain, found = score_statistic(columns.T @ columns, columns.T @ e)
         fitted = A @ np.linalg.lstsq(A, e, rcond=None)[0]
         assert found == rank and gain == pytest.approx(fitted @ fitted, rel=1e-5)
-    some = first_order_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
+    some = score_statistic(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
     assert some[1] == 3 and some[0] < gain
 
 
@@ -155,7 +155,7 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
     state = State.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
     found = fit_with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
-    assert found.spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
+    assert found.contact_spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
     assert found.model.steps[0].time == 100.99
     for k, kind in enumerate(kinds, start=1):
@@ -183,11 +183,11 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
-    monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_GAIN_ERROR", 1.0)
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_CHANNEL_GAIN_ERROR", 1.0)
     (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
     gain = 2.0 * (contact.state.likelihood - state.likelihood)
-    assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
+    assert contact.name == "contact" and contact.state.contact_spans == ((found_start, found_stop),)
     assert contact.score == pytest.approx(gain - price)
 
 

@@ -11,14 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.instants import (
-    WRENCH,
+    WRENCH_SIGNALS,
     Instants,
     block_means_of_record,
     delay_of_free_fit,
 )
-from drake_teleop.logs.causes.intervals import misfit_deviation_factor
+from drake_teleop.logs.causes.intervals import widening_factor_by_misfit
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
-from drake_teleop.logs.causes.state import UsedRows, fit_model, is_in_spans, regularized_inverse
+from drake_teleop.logs.causes.state import (
+    UsedRows,
+    fit_model,
+    is_in_time_spans,
+    regularized_inverse,
+)
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])
@@ -85,7 +90,7 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     y = data.append_step_signals(())
     np.testing.assert_allclose(
-        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, WRENCH].T, atol=1e-9
+        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, WRENCH_SIGNALS].T, atol=1e-9
     )
     left = model.residual_coefficients(x) @ y[:, model.columns].T
     np.testing.assert_allclose(left, 0.0, atol=1e-9)
@@ -98,7 +103,9 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     )
     assert not model.start_parameters(x, Model())[DELAY_INDEX + 1 :].any()
     other = model.with_extension("torque factor")
-    np.testing.assert_array_equal(other.start_parameters(x, model)[other.slices[name]], values)
+    np.testing.assert_array_equal(
+        other.start_parameters(x, model)[other.parameter_slices[name]], values
+    )
 
 
 def test_axes_factor_and_steps_change_the_wrench_as_stated():
@@ -115,7 +122,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     rng = np.random.default_rng(0)
     data = record(rng.normal(size=(len(T), 6)))
     found = data.append_step_signals(model.step_times) @ model.wrench_coefficients(x[None])[0].T
-    rates = np.gradient(data.y[:, WRENCH], 0.02, axis=0)
+    rates = np.gradient(data.y[:, WRENCH_SIGNALS], 0.02, axis=0)
     inside = slice(2, -2)
     np.testing.assert_allclose(found[inside], (expected + 0.02 * rates)[inside], atol=1e-9)
 
@@ -169,8 +176,8 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
     deviations = np.sqrt(np.diag(found.covariance))
     assert np.abs(error / deviations).max() < 4.0
     assert np.linalg.norm(error[DELAY_INDEX + 1 :]) < 0.05 * np.linalg.norm(values)
-    np.testing.assert_allclose(found.filters[:, 1], -0.7, atol=0.25)
-    np.testing.assert_allclose(np.sqrt(found.power) / white, 1.0, atol=0.25)
+    np.testing.assert_allclose(found.noise_filters[:, 1], -0.7, atol=0.25)
+    np.testing.assert_allclose(np.sqrt(found.noise_power) / white, 1.0, atol=0.25)
 
 
 def test_inverse_has_large_values_only_for_undetermined_parameters():
@@ -202,7 +209,7 @@ def test_instants_are_block_means(size):
     np.testing.assert_array_equal(np.flatnonzero(~data.used), [0, 50, 119, 199])
     np.testing.assert_allclose(data.t, t.reshape(200, size).mean(axis=1))
     means = noise.reshape(200, size, 6).mean(axis=1)
-    np.testing.assert_allclose(data.y[data.used][:, WRENCH], means[data.used])
+    np.testing.assert_allclose(data.y[data.used][:, WRENCH_SIGNALS], means[data.used])
     np.testing.assert_allclose(
         data.wrench_noise * np.sqrt(size), np.repeat([0.4, 0.03], 3), rtol=0.25
     )
@@ -213,7 +220,7 @@ def test_instants_are_block_means(size):
 
 def test_rows_within_spans_are_marked():
     data = record(np.zeros((len(T), 6)))
-    inside = is_in_spans(data, ((101.0, 101.5), (103.0, 103.0)))
+    inside = is_in_time_spans(data, ((101.0, 101.5), (103.0, 103.0)))
     np.testing.assert_allclose(data.t[inside], [*np.arange(101.0, 101.51, 0.02), 103.0])
 
 
@@ -236,4 +243,4 @@ def test_deviations_widen_with_the_scatter_of_parts_and_with_a_smooth_misfit(
         smooth_misfit=smooth,
         x=np.concatenate([OFFSETS, PHI]),
     )
-    assert misfit_deviation_factor(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)
+    assert widening_factor_by_misfit(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)

@@ -14,7 +14,7 @@ from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_fau
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     Hypothesis,
-    _weighted_number_of_deviations,
+    _weighted_number_of_faults,
     find_offset_step,
     hypothesis_without_fault,
     spread_and_centre_of_calm_half,
@@ -73,7 +73,7 @@ def test_findings_contain_figures_and_units(change, expected):
     ],
 )
 def test_each_deviation_has_its_price(change, count):
-    assert _weighted_number_of_deviations(replace(PLAIN, **change), 2.0) == count
+    assert _weighted_number_of_faults(replace(PLAIN, **change), 2.0) == count
 
 
 @pytest.mark.parametrize("gain", [(1.0, 1.0), (0.3, 7.0)])

@@ -368,7 +368,7 @@ def test_error_names_the_missing_library(tmp_path: Path, monkeypatch: pytest.Mon
         list_topics(tmp_path / "run1")
 
 
-@pytest.mark.parametrize("limit", ["_UNPACKED_BYTES_MARGIN", "_MAX_ADDED_MEMORY_BYTES"])
+@pytest.mark.parametrize("limit", ["_UNPACKED_BYTES_MARGIN", "_MAX_ADDED_PROCESS_MEMORY_BYTES"])
 def test_bag_with_excessive_uncompressed_size_raises_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:

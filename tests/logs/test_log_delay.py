@@ -71,7 +71,7 @@ def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float)
     wrench = non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
     log = Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
     fit = fit_load(log)
-    assert fit.independent == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
+    assert fit.independent_samples == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
     assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
 
 
@@ -81,7 +81,7 @@ def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
     wrench = non_contact_wrench(s, rest, rest, PHI) + 3.0
     fit = fit_load(Log(np.arange(30.0), wrench, s, rest, rest, static=True))
     assert fit.mass == pytest.approx(PHI[0], rel=1e-6) and fit.is_good
-    assert fit.independent == 30 - 8
+    assert fit.independent_samples == 30 - 8
 
 
 def test_a_good_fit_explains_most_and_has_a_mass() -> None:

@@ -49,7 +49,7 @@ def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
         raise error("of our own")
 
     monkeypatch.setattr(processing, "check_file", fail)
-    monkeypatch.setattr(conventions, "_is_suspicious", lambda _: True)
+    monkeypatch.setattr(conventions, "_are_signals_suspicious", lambda _: True)
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 
 

@@ -143,14 +143,18 @@ def test_mounting_is_estimated_within_its_deviations(
 ) -> None:
     found = mounting(Recorder(R_SI, p_SoIo_S, seed), gyroscope=gyroscope)
     assert (
-        found.is_determined and found.lever is not None and found.lever.is_determined_by_axis.all()
+        found.is_determined
+        and found.lever_arm is not None
+        and found.lever_arm.is_determined_by_axis.all()
     )
     # Interpolation of the pose causes errors of 0.1 % of lever arm and rotation.
     error = np.abs(rotation_vector_deg(found.R_SI @ R_SI.T))
     assert (error < 5 * found.deviations_deg + 0.02).all()
-    assert (np.abs(found.lever.p_SoIo_S - p_SoIo_S) < 5 * found.lever.deviations + 3e-4).all()
+    assert (
+        np.abs(found.lever_arm.p_SoIo_S - p_SoIo_S) < 5 * found.lever_arm.deviations + 3e-4
+    ).all()
     assert found.deviations_deg.max() < 0.1
-    assert found.lever.deviations.max() < 5e-4
+    assert found.lever_arm.deviations.max() < 5e-4
     assert found.lag_s == pytest.approx(LAG, abs=3e-4)
 
 
@@ -170,9 +174,9 @@ def test_deviations_equal_the_scatter_of_repeated_records() -> None:
     ratios = []
     for seed, (R_SI, p) in enumerate(truth):
         found = mounting(Recorder(R_SI, p, seed, noise=8.0), gyroscope=False)
-        assert found.lever is not None
+        assert found.lever_arm is not None
         ratios.append(rotation_vector_deg(found.R_SI @ R_SI.T) / found.deviations_deg)
-        ratios.append((found.lever.p_SoIo_S - p) / found.lever.deviations)
+        ratios.append((found.lever_arm.p_SoIo_S - p) / found.lever_arm.deviations)
     ratios = np.array(ratios)
     # 95 % of 96 ratios should be within +-1.96: at least 86 in 99 of 100 such tests.
     assert (np.abs(ratios) < 1.96).sum() >= 86
@@ -247,7 +251,7 @@ def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None
     recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=rotation_about_y)
     streams = {"pose": True} if source == "pose" else {"pose": False}
     at_Io = read_description(described(**streams), "log.yaml", tables=recorder.tables())
-    lever = mounting(recorder).lever if source == "pose" else lever_arm_from_wrench(at_Io)
+    lever = mounting(recorder).lever_arm if source == "pose" else lever_arm_from_wrench(at_Io)
     assert lever is not None and lever.source == source
     assert lever.is_determined_by_axis.tolist() == [True, False, True]
     known = lever.is_determined_by_axis
@@ -267,7 +271,7 @@ def test_orientation_alone_does_not_determine_the_lever_arm() -> None:
         motion=lambda t: rotation_about_y(t, arm=0.3),
     )
     found = mounting(recorder, gyroscope=False, positioned=False)
-    assert found.lever is None
+    assert found.lever_arm is None
     # The arc does not affect the estimated rotation.
     assert found.is_determined
     assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.3
@@ -381,9 +385,9 @@ def test_gaps_are_excluded_from_the_mounting() -> None:
             tables[Path(name)], columns={k: x[kept] for k, x in columns.items()}
         )
     found = mounting(recorder, tables)
-    assert found.lever is not None and found.is_determined and found.unexplained < 1e-3
+    assert found.lever_arm is not None and found.is_determined and found.unexplained < 1e-3
     assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.1
-    assert np.abs(found.lever.p_SoIo_S - p).max() < 1e-3
+    assert np.abs(found.lever_arm.p_SoIo_S - p).max() < 1e-3
 
 
 # Real records

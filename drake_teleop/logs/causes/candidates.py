@@ -13,10 +13,10 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.changes import add_step, find_contact_spans
 from drake_teleop.logs.causes.instants import (
     CONSTANT_COLUMN,
-    GRAVITY,
-    ROTATION,
-    SPECIFIC_FORCE,
-    WRENCH,
+    GRAVITY_SIGNALS,
+    ROTATION_SIGNALS,
+    SPECIFIC_FORCE_SIGNALS,
+    WRENCH_SIGNALS,
 )
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
@@ -35,21 +35,21 @@ TORQUE_UNIT_FACTORS = tuple(
 )
 """Ratios of known units and signs between torque and force."""
 _MAX_RESIDUAL_SHARE_OF_PERMUTATION, _SCORE_OF_AVOIDED_NEGATIVE_MASS = 0.5, 1000.0
-_MIN_TILT_DEG, _MAX_GRAVITY_ERROR_IF_TILTED, _MAX_GRAVITY_ERROR_IF_UPRIGHT = 0.25, 0.05, 0.02
+_MIN_GRAVITY_TILT_DEG, _MAX_GRAVITY_ERROR_TILTED, _MAX_GRAVITY_ERROR_UPRIGHT = 0.25, 0.05, 0.02
 _MIN_REMOVED_MASS_SHARE, _MIN_REMOVED_MOMENT_ARM_M = 0.02, 0.004
-_MIN_GAIN_ERROR = 0.003
-_MAX_GAIN_ERROR = 0.25
-_MIN_FRAME_SHIFT_M = 0.010
+_MIN_CHANNEL_GAIN_ERROR = 0.003
+_MAX_CHANNEL_GAIN_ERROR = 0.25
+_MIN_POSE_SHIFT_M = 0.010
 _MIN_SENSOR_ROTATION_DEG = 1.0
-_MIN_MASS_OVER_DEVIATION = 10.0
-_MAX_FRAME_SHIFT_M = 1.5
+_MIN_LOAD_MASS_OVER_DEVIATION = 10.0
+_MAX_POSE_SHIFT_M = 1.5
 _MAX_CABLE_STIFFNESS_N_M = 1000.0
 _MIN_DRIFT_OVER_NOISE = 3.0
-_NEGATIVE_INERTIA_DEVIATIONS, _NEGATIVE_INERTIA_SHARE = 8.0, 0.1
-_FACTOR_ERROR_MARGIN, _MAX_FACTOR_ERROR, _MAX_ERROR_OF_EXTREME_FACTOR = 0.02, 0.06, 0.2
-_MIN_MODERATE_FACTOR, _LOG_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
+_NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
+_TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
+_MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
 _DECISIVE_RESIDUAL_SHARE = 0.2
-_MAX_LOG_LIKELIHOOD_LOSS = 8.0  # of the logarithm; four standard deviations
+_MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
 _MAX_SCORE_OF_UNKNOWN_UNIT = 30.0  # score that widens intervals but names no cause
 
 
@@ -92,14 +92,14 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         if c not in model.gain_channels:
             larger = state.refit(replace(model, gain_channels=(*model.gain_channels, c)))
             if (
-                _MIN_GAIN_ERROR
+                _MIN_CHANNEL_GAIN_ERROR
                 < abs(larger.parameters_of_extension(f"gain {c}")[0][0])
-                < _MAX_GAIN_ERROR
+                < _MAX_CHANNEL_GAIN_ERROR
             ):
                 yield _scored_candidate("gain", state, larger)
     if "frame" not in model.extensions and data.accelerates_enough:
         yield from _fit_extension(
-            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _MIN_FRAME_SHIFT_M
+            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _MIN_POSE_SHIFT_M
         )
     if first and not model.extensions:
         angle = np.radians(_MIN_SENSOR_ROTATION_DEG)
@@ -107,7 +107,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
         )
     spans = find_contact_spans(state)
-    if spans and spans != state.spans:
+    if spans and spans != state.contact_spans:
         larger = State.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
@@ -143,7 +143,7 @@ def has_negative_mass(state: State) -> bool:
 
 
 def has_negative_inertia(state: State) -> bool:
-    if state.x[6] < _MIN_MASS_OVER_DEVIATION * np.sqrt(state.fit.covariance[6, 6]):
+    if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.fit.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
@@ -152,8 +152,8 @@ def has_negative_inertia(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    smallest = _NEGATIVE_INERTIA_SHARE * natural_scales(state.x[6:16])[10]
-    return bool(least[0] < -max(_NEGATIVE_INERTIA_DEVIATIONS * deviation, smallest))
+    smallest = _NEGATIVE_INERTIA_OVER_SCALE * natural_scales(state.x[6:16])[10]
+    return bool(least[0] < -max(_NEGATIVE_INERTIA_OVER_DEVIATION * deviation, smallest))
 
 
 def is_plausible(state: State) -> bool:
@@ -163,15 +163,15 @@ def is_plausible(state: State) -> bool:
     if "weight" in parts:
         removed = state.parameters_of_extension("weight")[0][0]
         # A robot adds no weight, and a removed weight requires an inertia to compare with.
-        if removed < -0.01 * state.x[6] or state.x[6] < _MIN_MASS_OVER_DEVIATION * deviation:
+        if removed < -0.01 * state.x[6] or state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
     if (
         "frame" in parts
-        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _MAX_FRAME_SHIFT_M
+        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _MAX_POSE_SHIFT_M
     ):
         return False
     if "cable" in parts:
-        if state.x[6] < _MIN_MASS_OVER_DEVIATION * deviation:
+        if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
         K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
         return bool(np.abs(np.linalg.eigvalsh(K)).max() < _MAX_CABLE_STIFFNESS_N_M)
@@ -187,8 +187,8 @@ def _is_tilt_significant(state: State) -> bool:
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > abs(size / right - 1.0)
-    share = _MAX_GRAVITY_ERROR_IF_TILTED if turned else _MAX_GRAVITY_ERROR_IF_UPRIGHT
-    return bool(angle > _MIN_TILT_DEG and abs(size / right - 1.0) < share)
+    share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
+    return bool(angle > _MIN_GRAVITY_TILT_DEG and abs(size / right - 1.0) < share)
 
 
 def start_parameters_of_tilt_fit(state: State) -> Array | None:
@@ -199,9 +199,9 @@ def start_parameters_of_tilt_fit(state: State) -> Array | None:
     J = np.zeros((7, 3, width))
     for i in range(3):
         J[i, i, CONSTANT_COLUMN] = 1.0
-        J[3, i, SPECIFIC_FORCE.start + i] = J[3, i, GRAVITY.start + i] = 1.0
-        J[4:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = np.eye(3)
-    force = np.eye(width)[WRENCH][:3]
+        J[3, i, SPECIFIC_FORCE_SIGNALS.start + i] = J[3, i, GRAVITY_SIGNALS.start + i] = 1.0
+        J[4:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = np.eye(3)
+    force = np.eye(width)[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
     found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
@@ -215,7 +215,7 @@ def start_parameters_of_tilt_fit(state: State) -> Array | None:
     x = model.start_parameters(state.x, state.model)
     x[6] = size / float(np.linalg.norm(given))
     x[7:16] = 0.0
-    x[model.slices["gravity"]] = given + u / size * np.linalg.norm(given)
+    x[model.parameter_slices["gravity"]] = given + u / size * np.linalg.norm(given)
     return x
 
 
@@ -242,7 +242,7 @@ def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
         model = replace(state.model, torque_factor=factor)
         fits.append(state.refit(model, state.x, steps=_TORQUE_FACTOR_ITERATIONS))
     most = max(x.likelihood for x in fits)
-    best = next(x for x in fits if x.likelihood > most - _LOG_LIKELIHOOD_TOLERANCE)
+    best = next(x for x in fits if x.likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
     by_residual = least < _DECISIVE_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
@@ -259,9 +259,9 @@ def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
     free = best.refit(best.model.with_extension("torque factor"))
     value, covariance = free.parameters_of_extension("torque factor")
     # A displaced pose frame resembles any factor, but only a distant frame resembles a large one.
-    far = not _MIN_MODERATE_FACTOR < best.model.torque_factor < 1.0 / _MIN_MODERATE_FACTOR
-    most = _MAX_ERROR_OF_EXTREME_FACTOR if far else _MAX_FACTOR_ERROR
-    limit = min(_FACTOR_ERROR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
+    far = not _MIN_USUAL_TORQUE_FACTOR < best.model.torque_factor < 1.0 / _MIN_USUAL_TORQUE_FACTOR
+    most = _MAX_EXTREME_TORQUE_FACTOR_ERROR if far else _MAX_TORQUE_FACTOR_ERROR
+    limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, more=1)
     # A factor beside the known ratios is not a cause, but widens the intervals.
     score = found.score if abs(value[0]) < limit else min(found.score, _MAX_SCORE_OF_UNKNOWN_UNIT)
@@ -274,7 +274,7 @@ def fits_with_other_torque_units(state: State) -> list[State]:
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
             fitted = state.refit(replace(state.model, torque_factor=other), state.x)
-            if fitted.likelihood > state.likelihood - _MAX_LOG_LIKELIHOOD_LOSS:
+            if fitted.likelihood > state.likelihood - _MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT:
                 found.append(fitted)
     return found
 
@@ -287,12 +287,12 @@ def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
     model = Model(extensions=state.model.extensions)
     used = [6, 7, 8, 9]
     if "weight" in model.extensions:
-        used.append(model.slices["weight"].start)
+        used.append(model.parameter_slices["weight"].start)
     J = model.wrench_derivative(np.zeros(model.size))[used, :3]
-    force = np.eye(len(sums))[WRENCH][:3]
+    force = np.eye(len(sums))[WRENCH_SIGNALS][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
-    total = float(np.trace(sums[WRENCH, WRENCH][:3, :3]))
+    total = float(np.trace(sums[WRENCH_SIGNALS, WRENCH_SIGNALS][:3, :3]))
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
     best: tuple[float, Array] = (np.inf, np.eye(3))
     plain = total

@@ -14,7 +14,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
 from drake_teleop.logs.causes.state import State
 
-_MAX_HAND_CONTACT_DISTANCE_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
+_MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
@@ -77,9 +77,11 @@ def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cau
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
-    changes = [_step_cause(state, i) for i in range(len(model.steps))]
+    changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
-    contacts = [span for span in state.spans if not _is_hand_contact(span, model.step_times)]
+    contacts = [
+        span for span in state.contact_spans if not _is_hand_contact(span, model.step_times)
+    ]
     changes += [_contact_cause(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
@@ -99,7 +101,7 @@ def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWit
         out.append(RecordPartWithLoad(start, time, (map_ @ state.x)[6:], spread))
         if i >= 0:
             map_ = map_.copy()
-            map_[6:, state.model.slices[f"step {i}"]] = np.eye(10)
+            map_[6:, state.model.parameter_slices[f"step {i}"]] = np.eye(10)
         start = time
     return out
 
@@ -228,7 +230,7 @@ def _cable_cause(state: State) -> Cause:
     )
 
 
-def _step_cause(state: State, i: int) -> Cause:
+def _offset_or_load_step_cause(state: State, i: int) -> Cause:
     step, (values, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":
@@ -254,7 +256,7 @@ def _step_cause(state: State, i: int) -> Cause:
 
 def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
     near = any(
-        span[0] - _MAX_HAND_CONTACT_DISTANCE_S < time < span[1] + _MAX_HAND_CONTACT_DISTANCE_S
+        span[0] - _MAX_HAND_CONTACT_TO_STEP_S < time < span[1] + _MAX_HAND_CONTACT_TO_STEP_S
         for time in times
     )
     return near and span[1] - span[0] < _MAX_HAND_CONTACT_DURATION_S

@@ -10,26 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
-from drake_teleop.logs.causes.instants import WRENCH
+from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
 from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
     State,
     TimeSpans,
-    first_order_gain,
-    is_in_spans,
+    is_in_time_spans,
     regularized_inverse,
+    score_statistic,
 )
 
-_MIN_LIKELIHOOD_GAIN = 60.0
-_REFINEMENT_MOVES_INSTANTS, _MAX_REFINEMENT_MOVES = (1.0, 0.25), 2  # instants
+_MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
+_STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-OMITTED_RAMP_S = 0.5
+MIN_RAMP_SPAN_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
 _NUM_TRIED_STEP_TIMES = 2
-_SIGNIFICANT_DEVIATIONS = 5.0
-_MIN_STEP_OVER_NOISE = 2.0
-_MIN_MASS_STEP_SHARE = 0.01
-_MIN_MOMENT_STEP_ARM_M = 0.002
+_MIN_STEP_OVER_DEVIATION = 5.0
+_MIN_OFFSET_STEP_OVER_NOISE = 2.0
+_MIN_MASS_STEP_OVER_MASS = 0.01
+_MIN_MOMENT_STEP_OVER_MASS_M = 0.002
 
 
 def add_step(state: State, kind: str) -> State | None:
@@ -40,7 +40,7 @@ def add_step(state: State, kind: str) -> State | None:
     best: State | None = None
     for time in _likely_step_times(state, kind):
         found = _refine_step_time(state, kind, time)
-        ramp = fit_with_ramps(state, [[kind]], [time], state.spans)
+        ramp = fit_with_ramps(state, [[kind]], [time], state.contact_spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
@@ -53,16 +53,16 @@ def _likely_step_times(state: State, kind: str) -> list[float]:
     data, rows = state.data, state.data.rows_per_block
     scan = _StepScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
-    gains = np.array([scan.gain_of_change_at(int(n)) for n in starts])
+    gains = np.array([scan.likelihood_gain_of_step_at(int(n)) for n in starts])
     for time in state.model.step_times:
         gains[np.abs(data.t[starts] - time) < _MIN_TIME_BETWEEN_STEPS_S] = 0.0
     out: list[float] = []
     for _ in range(_NUM_TRIED_STEP_TIMES):
         j = int(np.argmax(gains))
-        if gains[j] < _MIN_LIKELIHOOD_GAIN:
+        if gains[j] < _MIN_LIKELIHOOD_GAIN_OF_STEP:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
-        time = float(data.t[max(near, key=scan.gain_of_change_at)]) - 0.5 * data.dt
+        time = float(data.t[max(near, key=scan.likelihood_gain_of_step_at)]) - 0.5 * data.dt
         if all(abs(time - x) > _MIN_TIME_BETWEEN_STEPS_S for x in state.model.step_times):
             out.append(time)
         distance = max(2.0 * _MIN_TIME_BETWEEN_STEPS_S, 3.0 * rows * data.dt)
@@ -93,7 +93,7 @@ class _StepScan:
         flat = A.reshape(-1, A.shape[2])
         return flat.T @ flat, flat.T @ e.ravel()
 
-    def gain_of_change_at(self, n: int) -> float:
+    def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
         gram, right = self._sums_of_rows(n, j * self._rows)
         if j < len(self._gram):
@@ -102,7 +102,7 @@ class _StepScan:
         mixed = gram[:, which]
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
-        return first_order_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+        return score_statistic(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
 def fit_with_ramps(
@@ -113,7 +113,7 @@ def fit_with_ramps(
     widths: Sequence[float] | None = None,
 ) -> State:
     """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
-    widths = [max(OMITTED_RAMP_S, w + OMITTED_RAMP_S) for w in (widths or [0.0] * len(times))]
+    widths = [max(MIN_RAMP_SPAN_S, w + MIN_RAMP_SPAN_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
@@ -125,7 +125,7 @@ def fit_with_ramps(
     middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
-    return State.fit_record(state.data, model, found.x, found.spans)
+    return State.fit_record(state.data, model, found.x, found.contact_spans)
 
 
 def remove_small_steps(state: State) -> State:
@@ -138,11 +138,11 @@ def remove_small_steps(state: State) -> State:
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
         x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
-        state = State.fit_record(state.data, model, x, state.spans)
+        state = State.fit_record(state.data, model, x, state.contact_spans)
 
 
 def _squared_step_over_variance(state: State, i: int) -> float:
-    where = state.model.slices[f"step {i}"]
+    where = state.model.parameter_slices[f"step {i}"]
     x, covariance = state.x[where], state.fit.covariance[where, where]
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
@@ -152,7 +152,7 @@ def _estimate_ramp_middle(
 ) -> float:
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
-    rows = np.flatnonzero(data.used & is_in_spans(data, (span,)))
+    rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
@@ -175,8 +175,8 @@ def _refine_step_time(state: State, kind: str, time: float) -> State:
         return state.refit(model, start)
 
     best = fit_with_step_at(time)
-    for share in _REFINEMENT_MOVES_INSTANTS:
-        for _ in range(_MAX_REFINEMENT_MOVES):
+    for share in _STEP_TIME_MOVES_INSTANTS:
+        for _ in range(_MAX_STEP_TIME_MOVES):
             now = best.model.steps[-1].time
             tried = [
                 fit_with_step_at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)
@@ -189,31 +189,31 @@ def _refine_step_time(state: State, kind: str, time: float) -> State:
 
 
 def _is_step_significant(state: State, i: int) -> bool:
-    where = state.model.slices[f"step {i}"]
+    where = state.model.parameter_slices[f"step {i}"]
     values = state.x[where]
     deviations = np.sqrt(np.diag(state.fit.covariance[where, where]))
     if state.model.steps[i].kind == "offsets":
-        clear = np.abs(values) > _SIGNIFICANT_DEVIATIONS * deviations
+        clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations
         return bool(
-            (clear & (np.abs(values) > _MIN_STEP_OVER_NOISE * state.data.wrench_noise)).any()
+            (clear & (np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise)).any()
         )
     mass = max(abs(state.x[6]), 1e-3)
     heavier = abs(values[0]) > max(
-        _SIGNIFICANT_DEVIATIONS * deviations[0], _MIN_MASS_STEP_SHARE * mass
+        _MIN_STEP_OVER_DEVIATION * deviations[0], _MIN_MASS_STEP_OVER_MASS * mass
     )
     size, moment = np.linalg.norm(values[1:4]), np.linalg.norm(deviations[1:4])
-    moved = size > max(2.0 * _SIGNIFICANT_DEVIATIONS * moment, _MIN_MOMENT_STEP_ARM_M * mass)
+    moved = size > max(2.0 * _MIN_STEP_OVER_DEVIATION * moment, _MIN_MOMENT_STEP_OVER_MASS_M * mass)
     return bool(heavier or moved)
 
 
-_TRIED_KEPT_SHARES = (0.12, 0.3, 0.55)
+_TRIMMED_FIT_BLOCK_SHARES = (0.12, 0.3, 0.55)
 _MAX_TRIMMED_FIT_ITERATIONS = 15
-_MIN_FITTED_BLOCKS = 8
-_BLOCK_SET_GROWTH = 1.3
-_START_SET_LENGTHS_BLOCKS, _BOTH_ENDS_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
-_CONTACT_OVER_NOISE, _CONTACT_OVER_CALM, _EXCESS_OVER_CALM = 8.0, 5.0, 1.3
-_MAX_LOADS, _MAX_STEPS, _MIN_RUN_BLOCKS, _MAX_UNCOVERED_SHARE = 4, 4, 4, 0.12
-_MAX_RESIDUAL_INCREASE, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
+_MIN_TRIMMED_FIT_BLOCKS = 8
+_BLOCK_COUNT_GROWTH = 1.3
+_TRIED_START_RUN_LENGTHS_BLOCKS, _TRIED_END_RUN_LENGTHS_BLOCKS = (8, 16, 32), (2, 4, 8)
+_CONTACT_RMS_OVER_NOISE, _CONTACT_RMS_OVER_CALM, _CALM_RMS_MARGIN = 8.0, 5.0, 1.3
+_MAX_NUM_LOADS, _MAX_LOAD_STEPS, _MIN_CALM_RUN_BLOCKS, _MAX_UNFITTED_BLOCK_SHARE = 4, 4, 4, 0.12
+_MAX_STEP_OVER_CONTACT_RESIDUAL, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
 
 def find_contact_spans(state: State) -> TimeSpans:
@@ -237,17 +237,17 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
     blocks = _ResidualBlocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
-    for load in range(_MAX_LOADS):
+    for load in range(_MAX_NUM_LOADS):
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _keep_long_runs(left & ~contact_blocks, _MIN_RUN_BLOCKS)
+        calm = _keep_long_runs_of_true(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
-    if not len(inner) or left.sum() > _MAX_UNCOVERED_SHARE * blocks.usable.sum():
+    if not len(inner) or left.sum() > _MAX_UNFITTED_BLOCK_SHARE * blocks.usable.sum():
         return None
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
-    if not 0 < len(borders) <= _MAX_STEPS:
+    if not 0 < len(borders) <= _MAX_LOAD_STEPS:
         return None
     dt, rows = larger.data.dt, larger.data.rows_per_block
     t = larger.data.t[0] + dt * rows * np.arange(len(number))
@@ -255,11 +255,11 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
     found = fit_with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
     found = remove_small_steps(found)
-    limit = max(_MAX_RESIDUAL_INCREASE * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
+    limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
 
-def _keep_long_runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
+def _keep_long_runs_of_true(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
@@ -277,7 +277,7 @@ class _ResidualBlocks:
         self._counts = sums[:, 0, 0]
         self.usable = self._counts > 0.5 * data.rows_per_block
         J = state.model.wrench_derivative(state.x)
-        sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH] / max(self._counts.sum(), 1.0))
+        sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH_SIGNALS] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.wrench_noise, least)
         self._gram = np.zeros((len(sums), len(J), len(J)))
@@ -296,36 +296,36 @@ class _ResidualBlocks:
         if found is None:
             return None
         level, calm, move = found
-        excess = np.sqrt(np.maximum(level**2 - (_EXCESS_OVER_CALM * calm) ** 2, 0.0))
-        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_OVER_CALM * calm)))
+        excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
+        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
         by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
         usual = np.hypot(calm, by_motion)
         return np.asarray(
-            (level > _CONTACT_OVER_NOISE) & (level > _CONTACT_OVER_CALM * usual) & among
+            (level > _CONTACT_RMS_OVER_NOISE) & (level > _CONTACT_RMS_OVER_CALM * usual) & among
         )
 
     def _fit_calmest_blocks(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        if len(blocks) < 2 * _MIN_FITTED_BLOCKS:
+        if len(blocks) < 2 * _MIN_TRIMMED_FIT_BLOCKS:
             return None
         starts = [blocks]
-        for length in _START_SET_LENGTHS_BLOCKS:
+        for length in _TRIED_START_RUN_LENGTHS_BLOCKS:
             begins = range(0, len(blocks) - length // 2, length // 2)
             starts += [blocks[k : k + length] for k in begins]
         found, usual = [], np.inf
-        for kept, share in product(starts, _TRIED_KEPT_SHARES):
-            level, move, last = self._trimmed_fit(blocks, kept, share)
+        for kept, share in product(starts, _TRIMMED_FIT_BLOCK_SHARES):
+            level, move, last = self._trimmed_fit_of_blocks(blocks, kept, share)
             found.append((level, move))
-            if share == _TRIED_KEPT_SHARES[1]:
+            if share == _TRIMMED_FIT_BLOCK_SHARES[1]:
                 usual = min(usual, float(np.median(level[last])))
-        for length in _BOTH_ENDS_LENGTHS_BLOCKS:
-            level, move, last = self._trimmed_fit(
+        for length in _TRIED_END_RUN_LENGTHS_BLOCKS:
+            level, move, last = self._trimmed_fit_of_blocks(
                 blocks, np.r_[blocks[:length], blocks[-length:]], 0.0
             )
             calm = float(np.median(level[last]))
             if self._do_other_blocks_differ(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
-        limit = max(_CONTACT_OVER_NOISE**2, (_CONTACT_OVER_CALM**2) * usual)
+        limit = max(_CONTACT_RMS_OVER_NOISE**2, (_CONTACT_RMS_OVER_CALM**2) * usual)
         level, move = min(found, key=lambda x: float(np.minimum(x[0][blocks], limit).sum()))
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
@@ -337,18 +337,19 @@ class _ResidualBlocks:
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
         return bool(
-            np.mean(level[others] > _CONTACT_OVER_CALM**2 * predicted) > 1.0 - _MAX_UNCOVERED_SHARE
+            np.mean(level[others] > _CONTACT_RMS_OVER_CALM**2 * predicted)
+            > 1.0 - _MAX_UNFITTED_BLOCK_SHARE
         )
 
-    def _trimmed_fit(
+    def _trimmed_fit_of_blocks(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
     ) -> tuple[Array, Array, NDArray[np.intp]]:
-        keep = max(_MIN_FITTED_BLOCKS, int(share * len(blocks)))
+        keep = max(_MIN_TRIMMED_FIT_BLOCKS, int(share * len(blocks)))
         for _ in range(_MAX_TRIMMED_FIT_ITERATIONS):
             move = regularized_inverse(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
             left = self._square - 2.0 * self._right @ move + (self._gram @ move) @ move
             level = left / (6.0 * np.maximum(self._counts, 1.0))
-            size = min(keep, 1 + int(_BLOCK_SET_GROWTH * len(kept))) if len(kept) < keep else keep
+            size = min(keep, 1 + int(_BLOCK_COUNT_GROWTH * len(kept))) if len(kept) < keep else keep
             chosen = np.sort(blocks[np.argsort(level[blocks])[:size]])
             if np.array_equal(chosen, kept):
                 break
@@ -390,11 +391,11 @@ def replace_steps_by_contact(state: State) -> State:
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
-            return State.fit_record(state.data, model, x, (*state.spans, span))
-        if _median_residual_over_noise(state, span) > _CONTACT_OVER_NOISE:
-            calm = State.fit_record(state.data, model, x, (*state.spans, span))
+            return State.fit_record(state.data, model, x, (*state.contact_spans, span))
+        if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
+            calm = State.fit_record(state.data, model, x, (*state.contact_spans, span))
             if calm.residual_ratio < min(
-                _CONTACT_OVER_CALM, state.residual_ratio / _CONTACT_OVER_CALM
+                _CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM
             ):
                 return shrink_contacts(calm)
     return state
@@ -403,7 +404,7 @@ def replace_steps_by_contact(state: State) -> State:
 def shrink_contacts(state: State) -> State:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
-    spans = [_shrunk_contact_span(state, span) for span in state.spans]
+    spans = [_shrunk_contact_span(state, span) for span in state.contact_spans]
     return State.fit_record(
         state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
     )
@@ -411,12 +412,12 @@ def shrink_contacts(state: State) -> State:
 
 def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
     data = state.data
-    inside = np.flatnonzero(data.used & is_in_spans(data, (span,)))
+    inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
     usual = np.maximum(
         np.maximum(data.wrench_noise, state.rows.residual_rms(state.fit.residual)), 1e-12
     )
-    large = (np.abs(y[inside] @ state.fit.residual.T) > _CONTACT_OVER_CALM * usual).any(axis=1)
+    large = (np.abs(y[inside] @ state.fit.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
     first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
     if not len(first):
         return span
@@ -425,7 +426,7 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
 
 
 def _median_residual_over_noise(state: State, span: tuple[float, float]) -> float:
-    chosen = state.rows.used & is_in_spans(state.data, (span,))
+    chosen = state.rows.used & is_in_time_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
     e = np.abs(state.rows.y[chosen] @ state.fit.residual.T)
@@ -436,7 +437,7 @@ def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False
-    a, b = (state.model.slices[f"step {k}"] for k in (i, j))
+    a, b = (state.model.parameter_slices[f"step {k}"] for k in (i, j))
     both = state.x[a] + state.x[b]
     covariance = state.fit.covariance
     variance = np.diag(covariance[a, a] + covariance[b, b] + 2.0 * covariance[a, b])

@@ -31,11 +31,11 @@ from drake_teleop.logs.causes.changes import (
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
-    gain_covariance,
-    jackknife_over_parts,
+    jackknife_load_deviations,
     load_covariance,
-    misfit_deviations,
-    torque_unit_covariance,
+    load_covariance_by_gain_errors,
+    load_covariance_by_torque_unit,
+    load_deviations_if_unexplained,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
 from drake_teleop.logs.causes.state import State
@@ -45,29 +45,29 @@ InstantsAtDelay = Callable[[float], Instants]
 _MIN_CORRECTED_DELAY_S = 5e-4
 _MAX_CORRECTED_DELAY_S = 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
-_DELAY_ITERATIONS = 4
-MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
-"""Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
-_MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
-_HALVED_RESIDUAL = 0.5
+_MAX_DELAY_ITERATIONS = 4
+MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1.25, 2.2, 20.0
+"""Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
+_MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
+_MAX_CONTACT_RESIDUAL_SHARE = 0.5
 _MUCH_SMALLER_RESIDUAL = 0.2
-_COLOURED_NOISE_RATIO = 15.0
-_REDUCED_MISFIT_SHARE = 0.9
-_CERTAIN_SCORE = 1000.0
-_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
-_STEP_CAUSES, _MAX_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
-_SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
+_MAX_COLOURED_NOISE_RESIDUAL_RATIO = 15.0
+_MAX_EFFECTIVE_MISFIT_SHARE = 0.9
+_CERTAIN_CAUSE_SCORE = 1000.0
+_MIN_WEIGHT_OVER_CABLE_SCORE = 1.0 / 3.0
+_STEP_CAUSES, _MAX_CANDIDATE_RESIDUAL_INCREASE = ("offsets", "load"), 3.0
+_CAUSES_LIKE_COLOURED_NOISE = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
 _FLEXIBLE_CAUSES = ("cable", "drift")
 """Causes with many columns, which resemble others and require margins of their scores."""
-_FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE = 80.0, 0.1
+_FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 
 
 def residual_is_noise(state: State) -> bool:
     if (
         has_negative_inertia(state)
-        or state.residual_ratio > MAX_RESIDUAL_RATIO
-        or state.smooth_misfit > MAX_SMOOTH_MISFIT
+        or state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO
+        or state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
     ):
         return False
     model = state.model
@@ -80,7 +80,7 @@ def residual_is_noise(state: State) -> bool:
         for c in range(6)
         if c not in model.gain_channels
     ]
-    return all(state.score(x) < MAX_EXTENSION_SCORE for x in larger)
+    return all(state.score_of_larger_model(x) < MAX_NOISE_EXTENSION_SCORE for x in larger)
 
 
 SearchResult = tuple[State, float, list[Candidate]]
@@ -114,7 +114,8 @@ def search_causes(
         return found
     repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
     better = (
-        residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+        residual_is_noise(repeated[0])
+        or repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
     )
     better = better or (
         repeated[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
@@ -124,12 +125,18 @@ def search_causes(
 
 def may_be_coloured_noise(state: State) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
-    return state.smooth_misfit < GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
+    return (
+        state.smooth_misfit < GOOD_SMOOTH_MISFIT
+        and state.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+    )
 
 
 def is_clear_misfit(state: State) -> bool:
     """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
-    return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
+    return (
+        state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
+        or state.residual_ratio > _MAX_COLOURED_NOISE_RESIDUAL_RATIO
+    )
 
 
 def _initial_state(data: Instants, model: Model) -> State:
@@ -148,7 +155,7 @@ def _search_causes_from(
             return state, delay_s, []
         found = _remove_cable_if_attenuated(list(fit_candidates(state, first=number == 0)))
         rejected = [x for x in found if is_plausible(x.state)]
-        effective = [x for x in rejected if _is_effective(x, state)]
+        effective = [x for x in rejected if _is_misfit_reduced(x, state)]
         winner, calmest = (
             _best_candidate(effective),
             _candidate_with_smallest_residual(state, rejected),
@@ -164,7 +171,7 @@ def _search_causes_from(
         larger = replace_steps_by_contact(winner.state)
         if winner.name == "contact":
             larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
-        elif larger.spans != winner.state.spans:
+        elif larger.contact_spans != winner.state.contact_spans:
             larger = replace_contacts_by_steps(larger) or larger
         state, delay_s = _apply_fitted_delay(larger, delay_s, with_delay)
         rejected = [x for x in rejected if x is not winner]
@@ -177,13 +184,13 @@ def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
-    return [x for x in found if x.name != "cable" or best < _WEIGHT_OVER_CABLE_SCORE * x.score]
+    return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
 def _apply_fitted_delay(
     state: State, delay_s: float, with_delay: InstantsAtDelay | None
 ) -> tuple[State, float]:
-    for _ in range(_DELAY_ITERATIONS):
+    for _ in range(_MAX_DELAY_ITERATIONS):
         if (
             with_delay is None
             or abs(state.x[DELAY_INDEX]) < _MIN_CORRECTED_DELAY_S
@@ -193,12 +200,12 @@ def _apply_fitted_delay(
         delay_s += float(state.x[DELAY_INDEX])
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
-        state = State.fit_record(with_delay(delay_s), state.model, x, state.spans)
+        state = State.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
     return state, delay_s
 
 
 def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
-    small = [x for x in found if x.name in _SMOOTH_CAUSES]
+    small = [x for x in found if x.name in _CAUSES_LIKE_COLOURED_NOISE]
     small = [
         x for x in small if x.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * state.residual_ratio
     ]
@@ -217,47 +224,47 @@ def _explain_contact_by_steps(state: State, found: list[Candidate]) -> State | N
     for candidate in found:
         if (
             candidate.name == "contact"
-            and candidate.state.residual_ratio < _HALVED_RESIDUAL * state.residual_ratio
+            and candidate.state.residual_ratio < _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
         ):
             return replace_contacts_by_steps(candidate.state)
     return None
 
 
-def _is_effective(candidate: Candidate, state: State) -> bool:
+def _is_misfit_reduced(candidate: Candidate, state: State) -> bool:
     fitted = candidate.state
-    smaller = fitted.residual_ratio < _REDUCED_MISFIT_SHARE * state.residual_ratio
+    smaller = fitted.residual_ratio < _MAX_EFFECTIVE_MISFIT_SHARE * state.residual_ratio
     if candidate.name == "cable":
         return smaller  # the force of a cable far exceeds the noise
     if (
         candidate.name not in _STEP_CAUSES
-        and fitted.residual_ratio > _MAX_RESIDUAL_INCREASE * state.residual_ratio
+        and fitted.residual_ratio > _MAX_CANDIDATE_RESIDUAL_INCREASE * state.residual_ratio
     ):
         return False  # the candidate increases the residual, and coloured noise predicts it
-    better = smaller or fitted.smooth_misfit < _REDUCED_MISFIT_SHARE * state.smooth_misfit
-    return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_SCORE)
+    better = smaller or fitted.smooth_misfit < _MAX_EFFECTIVE_MISFIT_SHARE * state.smooth_misfit
+    return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_CAUSE_SCORE)
 
 
 def _best_candidate(found: list[Candidate]) -> Candidate | None:
     best = max([x.score for x in found], default=0.0)
-    if best < _MIN_SCORE:
+    if best < _MIN_CAUSE_SCORE:
         return None
     top = max(found, key=lambda x: x.score).name
     margin = (
-        max(_SCORE_MARGIN, _SCORE_MARGIN_SHARE * best)
+        max(_NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE * best)
         if top not in _FLEXIBLE_CAUSES
-        else max(_FLEXIBLE_SCORE_MARGIN, _FLEXIBLE_SCORE_MARGIN_SHARE * best)
+        else max(_FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE * best)
     )
-    near = [x for x in found if x.score > max(_MIN_SCORE, best - margin)]
+    near = [x for x in found if x.score > max(_MIN_CAUSE_SCORE, best - margin)]
     first = min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name))
     return (
         first
         if first.score
-        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
+        > _MIN_CAUSE_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
         else None
     )
 
 
-_MAX_ABSENT_MASS_KG, _ABSENT_MASS_DEVIATIONS, _SIGNIFICANT_DEVIATIONS = 0.010, 4.0, 20.0
+_MAX_ABSENT_MASS_KG, _ABSENT_MASS_OVER_DEVIATION, _PRESENT_MASS_OVER_DEVIATION = 0.010, 4.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +274,7 @@ class Explanation:
     Attributes:
         explained: whether the residual is sensor noise.
         theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
-        deviations: (16,) standard deviations of theta due to the misfit.
+        misfit_deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
@@ -278,7 +285,7 @@ class Explanation:
     explained: bool
     theta: Array
     covariance: Array
-    deviations: Array
+    misfit_deviations: Array
     delay_s: float
     loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
@@ -307,8 +314,8 @@ def explain_misfit(
     """
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, with_delay, always_fitted)
-        blocks = jackknife_over_parts(state)
-        gains = gain_covariance(state) + torque_unit_covariance(state)
+        blocks = jackknife_load_deviations(state)
+        gains = load_covariance_by_gain_errors(state) + load_covariance_by_torque_unit(state)
         covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
@@ -320,13 +327,13 @@ def explain_misfit(
             causes = [_no_load_cause(state, covariance)]
         removed = None
         if "weight" in state.model.extensions:
-            removed = state.x[state.model.slices["weight"]]
+            removed = state.x[state.model.parameter_slices["weight"]]
         return Explanation(
             causes=tuple(causes),
             explained=only_noise,
             theta=state.x[OFFSETS_AND_LOAD],
             covariance=covariance,
-            deviations=misfit_deviations(state, rejected, blocks, gains),
+            misfit_deviations=load_deviations_if_unexplained(state, rejected, blocks, gains),
             delay_s=delay_s + float(state.x[DELAY_INDEX]),
             loads=tuple(loads_between_changes(state, covariance)),
             removed_weight=removed,
@@ -338,8 +345,8 @@ def explain_misfit(
 def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     least = max(
-        _ABSENT_MASS_DEVIATIONS * deviation,
-        min(_MAX_ABSENT_MASS_KG, _SIGNIFICANT_DEVIATIONS * deviation),
+        _ABSENT_MASS_OVER_DEVIATION * deviation,
+        min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation),
     )
     return bool(mass < least and deviation < 0.1)
 

@@ -22,28 +22,28 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
 CONSTANT_COLUMN = 0
-SPECIFIC_FORCE = slice(1, 4)
-GRAVITY = slice(4, 7)
-ALPHA = slice(7, 10)
+SPECIFIC_FORCE_SIGNALS = slice(1, 4)
+GRAVITY_SIGNALS = slice(4, 7)
+ALPHA_SIGNALS = slice(7, 10)
 OMEGA_PRODUCTS = slice(10, 16)
-WRENCH = slice(16, 22)
-WRENCH_RATE = slice(22, 28)
-ROTATION = slice(28, 37)
+WRENCH_SIGNALS = slice(16, 22)
+WRENCH_RATE_SIGNALS = slice(22, 28)
+ROTATION_SIGNALS = slice(28, 37)
 R_P_PRODUCTS = slice(37, 64)
 TIME_POLYNOMIALS = slice(64, 67)
 NUM_SIGNALS = 67
 MOTION_COLUMNS = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
-_INSTANT_RATE_HZ, _MAX_ROWS = 50.0, 20_000
-_BLOCK_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
+_INSTANT_RATE_HZ, _MAX_INSTANTS = 50.0, 20_000
+_BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
 _MAX_EXACTLY_AVERAGED_SAMPLES = 5
 _MIN_ACCELERATION_OVER_NOISE = 4.0
 _MAX_ALPHA_NOISE_SHARE = 1.0 / 64.0
-_ALPHA_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
-_MIN_WRENCH_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
-_DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
+_ALPHA_SMOOTHING_WIDTHS_ROWS = (5, 9, 15, 25)  # windows for a noisy angular acceleration [rows]
+_MIN_WRENCH_NOISE_OVER_SPREAD = 1e-4  # smallest noise of a sensor, as a share of the wrench
+_MAX_TRIED_DELAY_S, _DELAY_STEP_S = 0.25, 0.01
 _LOAD_SIGNAL_COLUMNS = slice(0, 16)
-SYMMETRIC_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SYMMETRIC_MATRIX_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 MotionAtTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
@@ -77,7 +77,7 @@ class Instants:
         """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_ALPHA_NOISE_SHARE
-        a = (self.y[:, SPECIFIC_FORCE] + self.y[:, GRAVITY])[self.used]
+        a = (self.y[:, SPECIFIC_FORCE_SIGNALS] + self.y[:, GRAVITY_SIGNALS])[self.used]
         return bool(
             np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_OVER_NOISE * self.acceleration_noise
         )
@@ -90,7 +90,7 @@ class Instants:
     def rows_per_block(self) -> int:
         """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
-        return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
+        return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_LENGTH_S / self.dt))
 
     def select_rows(self, used: NDArray[np.bool_]) -> Instants:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
@@ -133,15 +133,17 @@ def block_means_of_record(
     [m/s^2], None without orientation. Samples with `lost` True are ignored.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
-    size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
+    size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_INSTANTS))
     rows = len(t) // size
     t, wrench = t[: rows * size], wrench[: rows * size]
     middle = t.reshape(rows, size).mean(axis=1)
     y = np.zeros((rows, NUM_SIGNALS))
     y[:, CONSTANT_COLUMN] = 1.0
-    y[:, WRENCH] = wrench.reshape(rows, size, 6).mean(axis=1)
-    y[1:-1, WRENCH_RATE] = (y[2:, WRENCH] - y[:-2, WRENCH]) / (2.0 * size * dt)
-    positions = _write_motion(y, t, size, motion, gravity_W)
+    y[:, WRENCH_SIGNALS] = wrench.reshape(rows, size, 6).mean(axis=1)
+    y[1:-1, WRENCH_RATE_SIGNALS] = (y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]) / (
+        2.0 * size * dt
+    )
+    positions = _write_motion_signals(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
     # Legendre polynomials.
     y[:, TIME_POLYNOMIALS] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
@@ -152,7 +154,7 @@ def block_means_of_record(
     white = white_noise_deviations(wrench)
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
-    white = np.maximum(white, _MIN_WRENCH_NOISE_SHARE * spread)
+    white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SPREAD * spread)
     share = _smooth_noisy_alpha(y, used) if gravity_W is None else 0.0
     out = Instants(
         middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
@@ -163,13 +165,13 @@ def block_means_of_record(
 def _smooth_noisy_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
-    alpha = y[used][:, ALPHA]
-    share = _smallest_noise_share(alpha)
-    for width in _ALPHA_SMOOTHING_WIDTHS:
-        if _smallest_noise_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
+    alpha = y[used][:, ALPHA_SIGNALS]
+    share = _smallest_noise_variance_share(alpha)
+    for width in _ALPHA_SMOOTHING_WIDTHS_ROWS:
+        if _smallest_noise_variance_share(alpha) < _MAX_ALPHA_NOISE_SHARE or width >= len(alpha):
             break
-        alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
-    y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
+        alpha = savgol_filter(y[used][:, ALPHA_SIGNALS], width, 2, axis=0)
+    y[np.flatnonzero(used)[:, None], np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop)] = alpha
     return share
 
 
@@ -180,22 +182,22 @@ def white_noise_deviations(x: Array) -> Array:
     return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
-def _smallest_noise_share(x: Array) -> float:
+def _smallest_noise_variance_share(x: Array) -> float:
     noise = white_noise_deviations(x)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
-def _write_motion(
+def _write_motion_signals(
     y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows = len(y)
     if not callable(motion):
-        columns = _signal_columns([x[: rows * size] for x in motion], gravity_W)
+        columns = _motion_signal_columns([x[: rows * size] for x in motion], gravity_W)
         _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(motion) == 5
     if size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
         found = motion(t)
-        columns = _signal_columns(found, gravity_W)
+        columns = _motion_signal_columns(found, gravity_W)
         _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(found) == 5
     # Simpson's rule over an interval with the variance of `size` samples.
@@ -205,19 +207,19 @@ def _write_motion(
     total = np.zeros(())
     for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
         found = motion(middle + shift)
-        total = total + weight / 6.0 * _signal_columns(found, gravity_W)
+        total = total + weight / 6.0 * _motion_signal_columns(found, gravity_W)
     _write_signal_columns(y, total)
     return len(found) == 5
 
 
 def _write_signal_columns(y: Array, columns: Array) -> None:
     y[:, 1:16] = columns[:, :15]
-    y[:, ROTATION.start : ROTATION.start + columns.shape[1] - 15] = columns[:, 15:]
+    y[:, ROTATION_SIGNALS.start : ROTATION_SIGNALS.start + columns.shape[1] - 15] = columns[:, 15:]
 
 
-def _signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
+def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     s, omega, alpha = motion[:3]
-    products = np.stack([omega[:, i] * omega[:, k] for i, k in SYMMETRIC_ENTRIES], axis=1)
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in SYMMETRIC_MATRIX_ENTRIES], axis=1)
     if len(motion) == 3 or gravity_W is None:
         return np.hstack([s, np.zeros_like(s), alpha, products])
     R_SW = np.swapaxes(motion[3], 1, 2)
@@ -232,10 +234,10 @@ def delay_of_free_fit(data: Instants) -> float:
 
     The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
     """
-    reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
+    reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
     spline = CubicSpline(data.t, data.y[:, _LOAD_SIGNAL_COLUMNS])
-    forces = data.y[rows][:, WRENCH]
+    forces = data.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 
     def log_residual(shift: float) -> float:

@@ -11,25 +11,25 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
-from drake_teleop.logs.causes.instants import ALPHA, WRENCH, white_noise_deviations
+from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS, white_noise_deviations
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
 from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
-_TOLERATED_JACKKNIFE_RATIO, _USUAL_JACKKNIFE_RATIO = 1.5, 1.15
-GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
+_MAX_JACKKNIFE_OVER_FIT, _USUAL_JACKKNIFE_OVER_FIT = 1.5, 1.15
+GOOD_SMOOTH_MISFIT, _WIDENING_BY_MISFIT = 1.35, 3.0
 """Largest smooth misfit of good records; growth of the deviations above it."""
-_MIN_INCLUDED_SCORE, _FULLY_INCLUDED_SCORE, _FULLY_INCLUDED_RESIDUAL_SHARE = 6.0, 15.0, 0.5
-_CABLE_DEVIATION_FACTOR = 1.5
+_MIN_WIDENING_SCORE, _FULLY_WIDENING_SCORE, _FULLY_WIDENING_RESIDUAL_SHARE = 6.0, 15.0, 0.5
+_CABLE_WIDENING_FACTOR = 1.5
 _LARGE_RESIDUAL_RATIO = 20.0
-_CLEAR_SMOOTH_MISFIT = 2.2
-_LARGE_SMOOTH_MISFIT = 6.0
+_MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL = 2.2
+_MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL = 6.0
 _CAUSES_IN_JACKKNIFE = ("offsets", "load", "linear drift", "drift")
 """Causes whose effects are included in the jackknife."""
-_TRIED_GAIN_DEVIATIONS = np.geomspace(1e-4, 0.1, 31)
-_MIN_LIKELIHOOD_GAIN = 20.0
+_TRIED_SENSOR_GAIN_STDS = np.geomspace(1e-4, 0.1, 31)
+_MIN_LIKELIHOOD_RISE_BY_GAINS = 20.0
 _MIN_SHARE_EXPLAINED_BY_GAINS = 0.5
-_MAX_GAIN_DEVIATION = 0.025
+_MAX_PLAUSIBLE_GAIN_STD = 0.025
 
 
 def load_covariance(
@@ -38,23 +38,23 @@ def load_covariance(
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
     out = state.fit.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
     deviations = np.sqrt(np.diag(out))
-    factor = misfit_deviation_factor(state, blocks)
+    factor = widening_factor_by_misfit(state, blocks)
     squares = np.maximum(factor * deviations, blocks) ** 2
     squares = squares + _variances_of_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
     return np.asarray(out * np.outer(ratio, ratio) + gains)
 
 
-def misfit_deviations(
+def load_deviations_if_unexplained(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
     if state.smooth_misfit > (
-        _CLEAR_SMOOTH_MISFIT
+        _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
-        else _LARGE_SMOOTH_MISFIT
+        else _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
     ):
-        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
+        blocks = blocks * (1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
     variance = blocks**2 + _variances_of_rejected_causes(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
@@ -65,24 +65,26 @@ def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -
     for candidate in rejected:
         other = candidate.state
         share = (
-            min(1.0, candidate.score / _FULLY_INCLUDED_SCORE)
-            if candidate.score > _MIN_INCLUDED_SCORE
+            min(1.0, candidate.score / _FULLY_WIDENING_SCORE)
+            if candidate.score > _MIN_WIDENING_SCORE
             else 0.0
         )
-        if other.residual_ratio < _FULLY_INCLUDED_RESIDUAL_SHARE * state.residual_ratio:
+        if other.residual_ratio < _FULLY_WIDENING_RESIDUAL_SHARE * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
         own = np.diag(other.fit.covariance)[OFFSETS_AND_LOAD]
         squares += share * ((other.x[OFFSETS_AND_LOAD] - state.x[OFFSETS_AND_LOAD]) ** 2 + own)
     return squares
 
 
-def gain_covariance(state: State) -> Array:
+def load_covariance_by_gain_errors(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
-    weights = rows.whitened_products(fit.filters) / fit.power[:, None, None]
+    weights = rows.whitened_products(fit.noise_filters) / fit.noise_power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
-    wrench = (rows.columns == np.arange(WRENCH.start, WRENCH.stop)[:, None]) - fit.residual
+    wrench = (
+        rows.columns == np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)[:, None]
+    ) - fit.residual
     J, inverse = state.model.wrench_derivative(state.x), fit.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
@@ -101,17 +103,17 @@ def gain_covariance(state: State) -> Array:
         more = std * std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_GAIN_DEVIATIONS])
+    likely = np.array([likelihood_with_gain_std(std) for std in _TRIED_SENSOR_GAIN_STDS])
     explaining = squares.sum() > _MIN_SHARE_EXPLAINED_BY_GAINS * state.gain_by_smooth_signals[0]
-    plausible = _TRIED_GAIN_DEVIATIONS[int(likely.argmax())] < _MAX_GAIN_DEVIATION
-    if likely.max() < _MIN_LIKELIHOOD_GAIN or not explaining or not plausible:
+    plausible = _TRIED_SENSOR_GAIN_STDS[int(likely.argmax())] < _MAX_PLAUSIBLE_GAIN_STD
+    if likely.max() < _MIN_LIKELIHOOD_RISE_BY_GAINS or not explaining or not plausible:
         return np.zeros((16, 16))
-    largest = _TRIED_GAIN_DEVIATIONS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
+    largest = _TRIED_SENSOR_GAIN_STDS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[OFFSETS_AND_LOAD]
     return np.asarray(effects @ effects.T)
 
 
-def torque_unit_covariance(state: State) -> Array:
+def load_covariance_by_torque_unit(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in fits_with_other_torque_units(state):
@@ -120,33 +122,31 @@ def torque_unit_covariance(state: State) -> Array:
     return out
 
 
-def attenuation_bias(state: State) -> Array:
+def load_bias_by_alpha_noise(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
-    at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
-    variance = white_noise_deviations(data.y[data.used][:, ALPHA]) ** 2
-    weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
+    at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))
+    variance = white_noise_deviations(data.y[data.used][:, ALPHA_SIGNALS]) ** 2
+    weights = state.rows.used.sum() * (fit.noise_filters**2).sum(axis=1) / fit.noise_power
     J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
     return np.asarray((fit.covariance @ right)[OFFSETS_AND_LOAD])
 
 
-def misfit_deviation_factor(state: State, blocks: Array) -> float:
+def widening_factor_by_misfit(state: State, blocks: Array) -> float:
     """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
-        factor = spread / _USUAL_JACKKNIFE_RATIO if spread > _TOLERATED_JACKKNIFE_RATIO else 1.0
+        factor = spread / _USUAL_JACKKNIFE_OVER_FIT if spread > _MAX_JACKKNIFE_OVER_FIT else 1.0
     if "cable" in state.model.extensions:
-        factor *= _CABLE_DEVIATION_FACTOR  # a spring models a cable only to first order
-    return factor * (
-        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - GOOD_SMOOTH_MISFIT)
-    )
+        factor *= _CABLE_WIDENING_FACTOR  # a spring models a cable only to first order
+    return factor * (1.0 + _WIDENING_BY_MISFIT * max(0.0, state.smooth_misfit - GOOD_SMOOTH_MISFIT))
 
 
-def jackknife_over_parts(state: State) -> Array:
+def jackknife_load_deviations(state: State) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)

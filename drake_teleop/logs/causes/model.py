@@ -13,18 +13,18 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
-    ALPHA,
+    ALPHA_SIGNALS,
     CONSTANT_COLUMN,
-    GRAVITY,
+    GRAVITY_SIGNALS,
     MOTION_COLUMNS,
     NUM_SIGNALS,
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
-    ROTATION,
-    SPECIFIC_FORCE,
+    ROTATION_SIGNALS,
+    SPECIFIC_FORCE_SIGNALS,
     TIME_POLYNOMIALS,
-    WRENCH,
-    WRENCH_RATE,
+    WRENCH_RATE_SIGNALS,
+    WRENCH_SIGNALS,
 )
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16
@@ -42,8 +42,8 @@ _NUM_EXTENSION_PARAMETERS = {
 _MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _ROTATION_COLUMNS_OF_STEP = slice(16, 25)
-_MAX_DELAY_STEP_S = 0.03  # s, in an iteration
-_ROTATION_STEP_RAD = 1e-4  # rad, step of the numerical derivative
+_MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03  # s, in an iteration
+_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 _SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -85,7 +85,7 @@ class Model:
         )
 
     @cached_property
-    def slices(self) -> dict[str, slice]:
+    def parameter_slices(self) -> dict[str, slice]:
         """Position of each extension's parameters in the parameter vector."""
         out, at = {}, DELAY_INDEX + 1
         sizes = [(name, _NUM_EXTENSION_PARAMETERS[name]) for name in self.extensions]
@@ -98,7 +98,7 @@ class Model:
 
     @property
     def size(self) -> int:
-        return max([DELAY_INDEX + 1, *(x.stop for x in self.slices.values())])
+        return max([DELAY_INDEX + 1, *(x.stop for x in self.parameter_slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
@@ -106,17 +106,17 @@ class Model:
         wide = bool({"gravity", "cable"} & set(self.extensions))
         kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
-            kept[ROTATION], kept[R_P_PRODUCTS] = False, False
+            kept[ROTATION_SIGNALS], kept[R_P_PRODUCTS] = False, False
             for i in range(len(self.steps)):
                 kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
         return np.flatnonzero(kept)
 
     @cached_property
-    def max_changes(self) -> Array:
+    def max_parameter_changes(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY_INDEX] = _MAX_DELAY_STEP_S
-        for name, where in self.slices.items():
+        out[DELAY_INDEX] = _MAX_DELAY_CHANGE_PER_ITERATION_S
+        for name, where in self.parameter_slices.items():
             out[where] = _MAX_CHANGE_PER_ITERATION.get(
                 name.split(" ")[0] if "gain" in name else name, np.inf
             )
@@ -130,14 +130,14 @@ class Model:
         """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
-        for name, where in self.slices.items():
-            if name in of.slices:
-                out[where] = x[of.slices[name]]
+        for name, where in self.parameter_slices.items():
+            if name in of.parameter_slices:
+                out[where] = x[of.parameter_slices[name]]
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
-        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
+        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.parameter_slices
         motion = self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
@@ -148,7 +148,7 @@ class Model:
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
-            out[..., GRAVITY] += static  # - V(-g) w
+            out[..., GRAVITY_SIGNALS] += static  # - V(-g) w
         if "cable" in parts:
             out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
         turned = self._sensor_rotations(x)
@@ -165,45 +165,45 @@ class Model:
     def _add_constant_extensions(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, CONSTANT_COLUMN] += x[:, :6]
-        out[:, channels, WRENCH_RATE.start + channels] += x[:, DELAY_INDEX, None]
+        out[:, channels, WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _columns_of_step(i).start] += x[:, self.slices[f"step {i}"]]
+                out[:, :, _columns_of_step(i).start] += x[:, self.parameter_slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
-            if name in self.slices:
-                rows = x[:, self.slices[name]].reshape(-1, 6, degree)
+            if name in self.parameter_slices:
+                rows = x[:, self.parameter_slices[name]].reshape(-1, 6, degree)
                 out[:, :, TIME_POLYNOMIALS.start : TIME_POLYNOMIALS.start + degree] += rows
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
-        parts = self.slices
+        parts = self.parameter_slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
         for rows, where in (
-            (slice(0, 3), SPECIFIC_FORCE),
-            (slice(3, 6), ALPHA),
+            (slice(0, 3), SPECIFIC_FORCE_SIGNALS),
+            (slice(3, 6), ALPHA_SIGNALS),
             (slice(6, 12), OMEGA_PRODUCTS),
         ):
             M[:, rows, where] = np.eye(rows.stop - rows.start)
         if "gravity" in parts:
             d = x[:, parts["gravity"]]
             for i in range(3):
-                M[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] += d
+                M[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
-            M[:, :3, ALPHA] -= cross_matrix(r)
+            M[:, :3, ALPHA_SIGNALS] -= cross_matrix(r)
             M[:, :3, OMEGA_PRODUCTS] += centripetal_matrix(r)
         return M
 
     def _sensor_rotations(self, x: Array) -> Array:
-        if "rotation" not in self.slices:
+        if "rotation" not in self.parameter_slices:
             return self.axes[None]
-        return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
+        return Rotation.from_rotvec(x[:, self.parameter_slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
         """Return the derivative (size, 6, k) of the coefficients of k signals by parameters x."""
         steps = np.ones(self.size)
-        if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _ROTATION_STEP_RAD
+        if "rotation" in self.parameter_slices:
+            steps[self.parameter_slices["rotation"]] = _ROTATION_DIFFERENCE_STEP_RAD
         moves = np.diag(steps)
         both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
@@ -212,7 +212,7 @@ class Model:
     def residual_coefficients(self, x: Array) -> Array:
         """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
-        out[np.arange(6), WRENCH.start + np.arange(6)] += 1.0
+        out[np.arange(6), WRENCH_SIGNALS.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
@@ -228,7 +228,7 @@ def _cable_coefficients(x: Array) -> Array:
     out = np.zeros((len(x), 6, NUM_SIGNALS))
     K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
     for i in range(3):
-        out[:, i, ROTATION.start + 3 * i : ROTATION.start + 3 * i + 3] = x[:, :3]
+        out[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = x[:, :3]
         out[:, i, R_P_PRODUCTS.start + 9 * i : R_P_PRODUCTS.start + 9 * i + 9] = K.reshape(-1, 9)
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

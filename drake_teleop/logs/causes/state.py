@@ -13,9 +13,9 @@ from drake_teleop.logs.causes.instants import (
     MAX_NOISE_LAG,
     OMEGA_PRODUCTS,
     R_P_PRODUCTS,
-    ROTATION,
-    SYMMETRIC_ENTRIES,
-    WRENCH,
+    ROTATION_SIGNALS,
+    SYMMETRIC_MATRIX_ENTRIES,
+    WRENCH_SIGNALS,
     Instants,
 )
 from drake_teleop.logs.causes.model import Model
@@ -100,15 +100,15 @@ class UsedRows:
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def is_in_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
+def is_in_time_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
     return inside
 
 
-_MAX_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
-_RIDGE, _NOISE_POWER_FLOOR = 1e-11, 1e-14
+_MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
+_RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +118,8 @@ class ModelFit:
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
         residual: (6, W) coefficients of the residual in the signals y.
-        filters: (6, 5) filters that whiten the residual e: sum over d of filters[c, d] e_c[n - d].
-        power: (6,) variance of the whitened residual.
+        noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
+        noise_power: (6,) variance of the whitened residual.
     """
 
     model: Model
@@ -127,17 +127,17 @@ class ModelFit:
     x: Array
     covariance: Array
     residual: Array
-    filters: Array
-    power: Array
+    noise_filters: Array
+    noise_power: Array
 
     @property
     def likelihood(self) -> float:
         """Logarithm of the likelihood up to a constant."""
-        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.power).sum())
+        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.noise_power).sum())
 
     def normal_equations(self, model: Model, x: Array) -> tuple[Array, Array]:
         """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
-        whitened = self.rows.whitened_products(self.filters) / self.power[:, None, None]
+        whitened = self.rows.whitened_products(self.noise_filters) / self.noise_power[:, None, None]
         J = model.wrench_derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
         gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
@@ -146,13 +146,13 @@ class ModelFit:
 
 
 def fit_model(
-    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_FIT_ITERATIONS
 ) -> ModelFit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
-    total = (rows.data.y[rows.used][:, WRENCH] ** 2).sum(axis=0) / count
+    total = (rows.data.y[rows.used][:, WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
-    floor = np.maximum(_NOISE_POWER_FLOOR * both, 1e-30)
+    floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
     filters = np.zeros((6, MAX_NOISE_LAG + 1))
     filters[:, 0] = 1.0
     found = ModelFit(
@@ -168,14 +168,14 @@ def fit_model(
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
         move = inverse @ right
-        move /= max(1.0, float(np.max(np.abs(move) / model.max_changes)))
+        move /= max(1.0, float(np.max(np.abs(move) / model.max_parameter_changes)))
         x = x + move
         residual = model.residual_coefficients(x)
-        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else MAX_NOISE_LAG
+        order = 0 if step + 1 < _UNWEIGHTED_FIT_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
         found = ModelFit(model, rows, x, inverse, residual, filters, power)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
-        if still and step > _UNWEIGHTED_ITERATIONS:
+        if still and step > _UNWEIGHTED_FIT_ITERATIONS:
             break
     return found
 
@@ -184,9 +184,9 @@ def regularized_inverse(gram: Array) -> Array:
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
     scaled = gram * np.outer(scale, scale)
-    scaled[np.diag_indices(len(gram))] += _RIDGE
+    scaled[np.diag_indices(len(gram))] += _RIDGE_OF_SCALED_GRAM
     values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(values, _RIDGE)
+    values = np.maximum(values, _RIDGE_OF_SCALED_GRAM)
     return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
 
 
@@ -195,17 +195,17 @@ _NUM_SMOOTH_SEGMENTS = 6
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Model fitted to the rows of a record outside of contacts (`spans`: start, stop [s])."""
+    """Model fitted to the rows of a record outside of `contact_spans` (start, stop) [s]."""
 
     data: Instants
-    spans: TimeSpans
+    contact_spans: TimeSpans
     fit: ModelFit
 
     @classmethod
     def fit_record(
         cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
     ) -> State:
-        used = data.used & ~is_in_spans(data, spans)
+        used = data.used & ~is_in_time_spans(data, spans)
         rows = UsedRows(data, used, model.step_times, model.columns)
         return cls(data, spans, fit_model(model, rows, start))
 
@@ -213,7 +213,9 @@ class State:
         if start is None:
             start = model.start_parameters(self.x, self.model)
         return State(
-            self.data, self.spans, fit_model(model, self._rows_for_model(model), start, **options)
+            self.data,
+            self.contact_spans,
+            fit_model(model, self._rows_for_model(model), start, **options),
         )
 
     def _rows_for_model(self, model: Model) -> UsedRows:
@@ -232,7 +234,7 @@ class State:
 
     def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
         """Return the parameters of a named extension of the model, and their covariance."""
-        where = self.model.slices[name]
+        where = self.model.parameter_slices[name]
         return self.x[where], self.fit.covariance[where, where]
 
     @property
@@ -242,11 +244,11 @@ class State:
     @cached_property
     def likelihood(self) -> float:
         """Logarithm of the likelihood of all rows; contacts have separate noise."""
-        if not self.spans:
+        if not self.contact_spans:
             return self.fit.likelihood
         used = self.data.used & ~self.rows.used
         inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
-        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
+        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.noise_power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
         every = UsedRows(self.data, self.data.used, (), self.model.columns)
         count = len(every.rows_with_predecessors) - len(self.rows.rows_with_predecessors)
@@ -272,35 +274,35 @@ class State:
         columns = np.hstack(
             [
                 y[:, : OMEGA_PRODUCTS.stop],
-                y[:, ROTATION] if self.data.gravity_W is not None else y[:, :0],
-                y[:, R_P_PRODUCTS] @ _stiffness_signals().T
+                y[:, ROTATION_SIGNALS] if self.data.gravity_W is not None else y[:, :0],
+                y[:, R_P_PRODUCTS] @ _cable_stiffness_signals().T
                 if self.data.has_positions
                 else y[:, :0],
                 part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
             ]
         )
         e = self.rows.y @ self.fit.residual.T
-        whole, filters = self.rows.rows_with_predecessors, self.fit.filters
+        whole, filters = self.rows.rows_with_predecessors, self.fit.noise_filters
         gain, freedom = 0.0, 0
         late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = first_order_gain(x.T @ x, x.T @ white)
-            gain, freedom = gain + solved / self.fit.power[c], freedom + rank
+            solved, rank = score_statistic(x.T @ x, x.T @ white)
+            gain, freedom = gain + solved / self.fit.noise_power[c], freedom + rank
         return gain, freedom
 
-    def score(self, model: Model) -> float:
+    def score_of_larger_model(self, model: Model) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""
         x = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
         residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
-        return first_order_gain(
+        return score_statistic(
             *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
         )[0]
 
 
-def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
@@ -314,9 +316,9 @@ def first_order_gain(gram: Array, right: Array, least: Array | float = 0.0) -> t
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _stiffness_signals() -> Array:
+def _cable_stiffness_signals() -> Array:
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(SYMMETRIC_ENTRIES):
+    for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0

@@ -19,9 +19,9 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Finding,
+    call_or_none_if_unreadable,
     edit_field,
-    result_for_edit_or_none,
-    with_opposite_sign,
+    edit_with_opposite_wrench_sign,
     wrench_and_motion_edits,
 )
 from drake_teleop.logs.check.log_data import LogData
@@ -41,7 +41,7 @@ GOOD_UNEXPLAINED = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
 VALID_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_IMPROVEMENT = 4.0
+MIN_REDUCTION_BY_EDIT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _LOAD_FIT_CUTOFF_HZ = 15.0
@@ -57,20 +57,20 @@ class LoadFit:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
-        unexplained, noise: shares of the wrench's variance: unexplained, and white noise.
+        unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
         mass: fitted mass [kg].
         independent: number of independent samples.
     """
 
     unexplained: float
     mass: float
-    noise: float = 0.0
-    independent: float = 1e9
+    noise_share: float = 0.0
+    independent_samples: float = 1e9
 
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise_share
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
@@ -79,7 +79,7 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))
     wrench = smooth.wrench[rows]
-    scale = _channel_scales(wrench)
+    scale = _wrench_channel_scales(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
     if "weight" in log.estimated and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
@@ -95,12 +95,12 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     total = float(w.var(axis=0).sum()) + 1e-30
     unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFit(unexplained, float(theta[0]), independent=max(1.0, len(w) - 8.0))
+        return LoadFit(unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
-    noise = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
-    independent = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
-    return LoadFit(unexplained, float(theta[0]), noise, independent)
+    noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
+    independent_samples = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
+    return LoadFit(unexplained, float(theta[0]), noise_share, independent_samples)
 
 
 def _fit_load_parameters(V: Array, w: Array) -> Array:
@@ -113,21 +113,21 @@ def _fit_load_parameters(V: Array, w: Array) -> Array:
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
     """Return the variance of a residual (N, 6) over that of the wrench (N, 6)."""
-    scale = _channel_scales(wrench)
+    scale = _wrench_channel_scales(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
 
 
-def _channel_scales(wrench: Array) -> Array:
+def _wrench_channel_scales(wrench: Array) -> Array:
     force, torque = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1))
     least = 1e-9 * float(np.abs(wrench).max()) + 1e-15
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-def min_reduction_factor(fit: LoadFit) -> float:
+def min_unexplained_reduction_by_edit(fit: LoadFit) -> float:
     """Return the factor by which a correction must reduce the unexplained share of a fit."""
-    n = max(1.0, fit.independent)
-    return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
+    n = max(1.0, fit.independent_samples)
+    return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
 UNDETERMINED_UNEXPLAINED_SHARE = 0.9
@@ -135,7 +135,7 @@ UNDETERMINED_UNEXPLAINED_SHARE = 0.9
 MIN_REPORTED_LAG_S = 0.002
 """Smallest reported delay [s]."""
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
-_MIN_DELAY_CHANGE_S, _MAX_DELAY_DEVIATION_SHARE = 0.03, 0.15
+_MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
 _MAX_UNEXPLAINED_AFTER_CORRECTION = 0.5
 
@@ -160,10 +160,10 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
         edits += _clock_offset_edits(description, thin)
     if not given.is_good:
         edits = [*wrench_and_motion_edits(description), *edits]
-    found = _better_edits(fit_edited_description, given, edits)
+    found = _edits_with_far_better_fit(fit_edited_description, given, edits)
     if not found and not given.is_good and not log.static:  # contact may hide what fits
         without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
-        found = _better_edits(without_contact, without_contact(description), edits)
+        found = _edits_with_far_better_fit(without_contact, without_contact(description), edits)
     if not found and given.is_good:
         return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
@@ -182,7 +182,7 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     return [first, *lag_finding(description, delay)], delay
 
 
-def _better_edits(
+def _edits_with_far_better_fit(
     fitted: Callable[[Description], LoadFit],
     given: LoadFit,
     edits: list[tuple[Finding | None, Description]],
@@ -193,17 +193,17 @@ def _better_edits(
     """
     positive, negative = [], []
     for finding, edited in edits:
-        fit = result_for_edit_or_none(fitted, edited)
+        fit = call_or_none_if_unreadable(fitted, edited)
         if fit is not None and fit.mass > 0:
             positive.append((fit, finding, edited))
         elif (
             fit is not None and finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN
         ):
-            negative.append((fit, *with_opposite_sign(finding, edited)))
+            negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = (
-        VALID_UNEXPLAINED + given.noise,
-        given.unexplained / min_reduction_factor(given),
+        VALID_UNEXPLAINED + given.noise_share,
+        given.unexplained / min_unexplained_reduction_by_edit(given),
     )
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
@@ -214,7 +214,7 @@ def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
     none, aligned = fit_load(log), fit_load(remove_delay(log, delay))
-    gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
+    gain = none.independent_samples * np.log(none.unexplained / (aligned.unexplained + 1e-30))
     return bool(gain > 25.0)
 
 
@@ -244,13 +244,13 @@ def _findings_without_remedy(
     smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
-    finding = undetermined_payload_finding(load, given.unexplained - given.noise)
+    finding = undetermined_payload_finding(load, given.unexplained - given.noise_share)
     if finding:
         return [finding], None
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_UNEXPLAINED + given.noise_share:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.
@@ -361,8 +361,8 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
     change = abs(slope) * span
     deviation = float(np.std(delays - late - slope * t))
     if (
-        change < _MIN_DELAY_CHANGE_S
-        or deviation > _MAX_DELAY_DEVIATION_SHARE * change
+        change < _MIN_DELAY_DRIFT_S
+        or deviation > _MAX_DELAY_DEVIATION_OVER_DRIFT * change
         or abs(slope) > 0.2
     ):
         return None

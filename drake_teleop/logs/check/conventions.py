@@ -36,13 +36,13 @@ from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table
 
-_MIN_MOTION_RMS = 0.3, 0.1
+_MIN_ACCELERATION_AND_SPEED_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
 """Fewest poses that allow a check of the fit."""
 _MIN_GRAVITY_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_MIN_LIVE_CHANGE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
+_MIN_WRENCH_CHANGE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def check_suspicious_load(
     clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
     if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
-        return tuple(_findings_except_lag(check)) if _is_suspicious(log) else ()
+        return tuple(_findings_except_lag(check)) if _are_signals_suspicious(log) else ()
     found = _findings_except_lag(check)
     if any(finding.name == "payload" for finding in found):
         own = undetermined_payload_finding(load, unexplained)
@@ -102,7 +102,7 @@ def check_suspicious_load(
     negative = load.mass < 0 and bool(load.identifiable[6])
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
     if worthless and not log.static:
-        _require_motion(log)
+        _require_enough_motion(log)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
         if not negative:
@@ -129,9 +129,9 @@ def _findings_except_lag(check: Callable[[], Conventions]) -> list[Finding]:
     return []
 
 
-def _require_motion(log: Log) -> None:
+def _require_enough_motion(log: Log) -> None:
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _MIN_MOTION_RMS[0] and omega < _MIN_MOTION_RMS[1]:
+    if s < _MIN_ACCELERATION_AND_SPEED_RMS[0] and omega < _MIN_ACCELERATION_AND_SPEED_RMS[1]:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
@@ -141,7 +141,7 @@ def _require_motion(log: Log) -> None:
         )
 
 
-def _is_suspicious(log: Log) -> bool:
+def _are_signals_suspicious(log: Log) -> bool:
     if log.static or log.described is None or Path(log.source).suffix.lower() in TABLE_READERS:
         return False
     few = log.select_rows(slice(None, None, max(1, int(0.01 / log.dt))))
@@ -165,7 +165,7 @@ def check_conventions(
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _MIN_LIVE_CHANGE * np.abs(log.wrench).max()).all())
+    return bool((np.ptp(log.wrench, axis=0) <= _MIN_WRENCH_CHANGE * np.abs(log.wrench).max()).all())
 
 
 def _check_description(data: LogData, description: Description) -> Conventions:
@@ -213,7 +213,7 @@ def _merge_clock_findings(
     delay: float | None,
 ) -> list[Finding]:
     clocks = [finding for finding in findings if finding.name == "clock"]
-    if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
+    if len(clocks) < 2 or mounting is None or mounting.clock_drift or delay is None:
         return findings
     if abs(mounting.lag_s + delay) > MIN_CLOCK_ERROR_S:
         return findings

@@ -125,7 +125,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
         yield _make_edit(description, "degrees", text, {f"{where}.unit": unit})
 
 
-def with_opposite_sign(finding: Finding, description: Description) -> Edit:
+def edit_with_opposite_wrench_sign(finding: Finding, description: Description) -> Edit:
     """Return finding and description of an edit, with the sign of the wrench inverted, too."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
@@ -134,7 +134,7 @@ def with_opposite_sign(finding: Finding, description: Description) -> Edit:
     return Finding(finding.name, text, finding.fields | {path: sign}), changed
 
 
-def result_for_edit_or_none(function: Callable[[Description], Any], edited: Description) -> Any:
+def call_or_none_if_unreadable(function: Callable[[Description], Any], edited: Description) -> Any:
     """Return `function(edited)`, or None if the edited description cannot be read."""
     try:
         return function(edited)

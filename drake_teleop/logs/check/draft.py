@@ -53,12 +53,12 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_BASE_FRAME_PATTERN = r"tcp_force$|^o_f_ext"
-_ROBOT_NOTES = {
+_BASE_AXES_COLUMN_PATTERN = r"tcp_force$|^o_f_ext"
+_ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
-_UNIT_NAMES = {
+_UNIT_OF_SPELLING = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
     "µs": "us",
     "°": "deg",
@@ -80,13 +80,13 @@ _ALLOWED_UNITS = {
 }
 _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _POSE_VECTOR_WIDTHS = (7, 8)
-_QUATERNION_TOLERANCE = 0.01  # of the length
+_QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_STAMP_FIELDS = ("column", "nanoseconds")
-_COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
+_TIME_STAMP_FIELDS = ("column", "nanoseconds")
+_COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _RAW_COUNTS_NOTE = (
@@ -98,15 +98,15 @@ _NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {r
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, and its comment lines (`head`)."""
+    """Draft of a log description: its streams as in YAML, and its comment lines."""
 
     streams: dict[str, Any]
-    head: list[str]
+    comment_lines: list[str]
 
     def text(self) -> str:
-        return to_yaml_text(self.streams, head=self.head)
+        return to_yaml_text(self.streams, head=self.comment_lines)
 
-    def corrected(self, finding: Finding) -> Draft:
+    def with_finding_corrected(self, finding: Finding) -> Draft:
         streams = copy.deepcopy(self.streams)
         for path, value in finding.fields.items():
             *outer, last = path.split(".")
@@ -114,7 +114,7 @@ class Draft(NamedTuple):
             for name in outer:
                 place = place.setdefault(name, {})
             place[last] = value
-        return Draft(streams, [*self.head, f"Corrected by the data: {finding.message}."])
+        return Draft(streams, [*self.comment_lines, f"Corrected by the data: {finding.message}."])
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
@@ -124,7 +124,7 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
         streams = whole | streams
     streams = streams or drafts[0].streams
-    lines = dict.fromkeys(line for draft in drafts for line in draft.head)
+    lines = dict.fromkeys(line for draft in drafts for line in draft.comment_lines)
     return Draft(
         {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}, list(lines)
     )
@@ -172,7 +172,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         _remove_trailing_number(plain[name][0])
         for name in found.get("force", _NO_COLUMNS).columns[:1]
     ]
-    if any(re.search(_BASE_FRAME_PATTERN, name) for name in forces):
+    if any(re.search(_BASE_AXES_COLUMN_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
@@ -196,7 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
     times = {
-        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
+        stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_STAMP_FIELDS
     }
     used |= times - {None}
     arrays = _names_of_array_columns(table)
@@ -212,7 +212,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         *([_NO_TORQUE_NOTE] if "force" in found and "torque" not in found else []),
         *([_NO_TIME_NOTE] if _FILL_IN_TEXT in times else []),
         *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN_TEXT}'" in str(draft) else []),
-        *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
+        *(text for what, text in _ROBOT_COLUMN_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
 
@@ -228,7 +228,7 @@ def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
 def _split_name_and_unit(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
-    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_NAMES:
+    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
         unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
@@ -291,21 +291,21 @@ def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
-            if _have_unit_length(table, quaternion):
+            if _are_unit_quaternions(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
                 return {kind: _UnitColumns(quaternion, ""), "position": _UnitColumns(position, "")}
     return {}
 
 
-def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
+def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
     length = np.linalg.norm(table.numbers_with_nan_side_by_side(quaternion, ""), axis=1)
-    return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
+    return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_LENGTH_TOLERANCE)
 
 
 def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
-    found = next((group for group in fours if _have_unit_length(table, group)), None)
+    found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
     return {"orientation": _UnitColumns(found, "")} if found else {}
 
 
@@ -359,7 +359,7 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
     if kind in ("force", "torque") and _are_raw_counts(table, found.columns):
         group["scale"] = _FILL_IN_TEXT
     if found.unit:
-        unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
+        unit = _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
     if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):
@@ -418,7 +418,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
                 len(table.columns[name]) != rows,
             )
         )
-    unit = _UNIT_NAMES.get(plain[named[0]][1].lower(), "")
+    unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
     for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
@@ -437,7 +437,7 @@ def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]
             return False
         steps = np.diff(values.astype(float))
         even = np.ptp(np.quantile(steps, [0.1, 0.9])) < steps.mean()
-        is_counter = re.search(_COUNTER_PATTERN, plain[name][0])
+        is_counter = re.search(_COUNTER_COLUMN_PATTERN, plain[name][0])
         return bool((steps > 0.0).all() and even and not is_counter)
 
     return [name for name in plain if is_clock(name)]

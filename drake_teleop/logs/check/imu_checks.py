@@ -8,16 +8,16 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
-    MIN_IMPROVEMENT,
+    MIN_REDUCTION_BY_EDIT,
     VALID_UNEXPLAINED,
 )
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
     Finding,
+    call_or_none_if_unreadable,
     edit_field,
     pose_edits,
-    result_for_edit_or_none,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
@@ -27,14 +27,14 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
 RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
-MIN_GRAVITY_ERROR = 0.02
+MIN_REPORTED_GRAVITY_ERROR = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
-_SIGNIFICANT_DEVIATIONS = 5.0
-_MIN_CORRELATION = 0.8
-_COMPARISON_CUTOFF_HZ = 5.0
-_MAX_UNSWAPPED_CORRELATION_SHARE = 0.5
-_WINDOW_LENGTH_RANGE_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
-_GYRO_AXES_RATE_HZ, _MIN_GRAVITY_MISFIT, _MIN_MISFIT_REDUCTION = 25.0, 0.05, 3.0
+_MIN_GRAVITY_ERROR_OVER_DEVIATION = 5.0
+_MIN_ALPHA_CORRELATION = 0.8
+_ALPHA_COMPARISON_CUTOFF_HZ = 5.0
+_MAX_UNSWAPPED_ALPHA_SHARE = 0.5
+_GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
+_GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
@@ -57,7 +57,7 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
     alpha = _angular_acceleration_axes_finding(imu, log)
     if alpha is not None:
         return [alpha], description
-    scale = _gravity_finding(imu, log, gravity)
+    scale = _gravity_magnitude_finding(imu, log, gravity)
     return ([] if scale is None else [scale]), description
 
 
@@ -68,7 +68,7 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     given_alpha, derived_alpha = _given_and_derived_alpha(log)
     sizes = float(np.linalg.norm(given_alpha)), float(np.linalg.norm(derived_alpha))
     correlation = float(np.sum(given_alpha * derived_alpha))
-    if min(sizes) == 0.0 or correlation < _MIN_CORRELATION * sizes[0] * sizes[1]:
+    if min(sizes) == 0.0 or correlation < _MIN_ALPHA_CORRELATION * sizes[0] * sizes[1]:
         return None
     ratio, (least, most) = sizes[0] / sizes[1], RANGE_OF_DEGREES_PER_RADIAN
     for wrong, quantity, unit, other in (
@@ -85,21 +85,21 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 def _given_and_derived_alpha(log: Log) -> tuple[Array, Array]:
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    given = low_pass(log.angular_acceleration, log.dt, _COMPARISON_CUTOFF_HZ)
-    return given, low_pass(rate, log.dt, _COMPARISON_CUTOFF_HZ)
+    given = low_pass(log.angular_acceleration, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
+    return given, low_pass(rate, log.dt, _ALPHA_COMPARISON_CUTOFF_HZ)
 
 
 def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
     assert imu.angular_velocity is not None
     few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
-    if not given > _MIN_GRAVITY_MISFIT:
+    if not given > _MIN_WRONG_AXES_MISFIT:
         return None
     best, P = min(
         ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
         key=lambda entry: entry[0],
     )
-    if _MIN_MISFIT_REDUCTION * best > given:
+    if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
     order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -125,7 +125,7 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_CORRELATION_SHARE * largest:
+    if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_ALPHA_SHARE * largest:
         return None
     axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
@@ -141,10 +141,10 @@ def _windowed_specific_forces(log: Log, P: Array) -> Array:
 
     The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
     """
-    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_LENGTH_RANGE_S))
+    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_GRAVITY_WINDOW_RANGE_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
-    starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_WINDOWS)).astype(int)
+    starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_GRAVITY_WINDOWS)).astype(int)
     take = starts[:, None] + np.arange(3 * half)
     omega, s = log.angular_velocity[take] @ P.T, log.specific_force[take]
     steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
@@ -167,15 +167,15 @@ def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
     return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
 
 
-def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
+def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
     forces = _windowed_specific_forces(log, np.eye(3))[0]
-    if len(forces) < _MIN_WINDOWS:
+    if len(forces) < _MIN_GRAVITY_WINDOWS:
         return None
     ratios = np.linalg.norm(forces, axis=1) / gravity
     ratio, deviation = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     off = abs(ratio - 1.0)
     if not 0.7 < ratio < 1.4 or off < max(
-        MIN_GRAVITY_ERROR + 3.0 * deviation, _SIGNIFICANT_DEVIATIONS * deviation
+        MIN_REPORTED_GRAVITY_ERROR + 3.0 * deviation, _MIN_GRAVITY_ERROR_OVER_DEVIATION * deviation
     ):
         return None
     assert imu.specific_force is not None
@@ -209,9 +209,9 @@ def check_imu_against_pose(
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
-            if (found := result_for_edit_or_none(fit_mounting, edited)) and not found.is_mirrored
+            if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_IMPROVEMENT)
+        limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_REDUCTION_BY_EDIT)
         if given.is_mirrored:
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
         elif given.rotation_angle_deg > 10 and given.unexplained < VALID_UNEXPLAINED:
@@ -225,7 +225,7 @@ def check_imu_against_pose(
             description, given = best[2], best[3]
     if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
-    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
+    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
@@ -262,7 +262,7 @@ def check_imu_against_pose(
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
     assert description.imu is not None and description.wrench is not None
     time = description.imu.time
-    if not found.drift:
+    if not found.clock_drift:
         offset = time.offset - found.lag_s
         finding = Finding(
             "clock",
@@ -273,14 +273,14 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
     start = data.start_time_of_stream(description.imu, description) - data.start_time_of_stream(
         description.wrench, description
     )
-    scale = 1 / (1 + found.drift)
-    lag = scale * (found.mid_record_lag_s + found.drift * (start - found.mid_record_time_s))
+    scale = 1 / (1 + found.clock_drift)
+    lag = scale * (found.mid_record_lag_s + found.clock_drift * (start - found.mid_record_time_s))
     offset, factor = time.offset - lag, scale * time.scale
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
-        f" {1e3 * found.drift:.3g} ms more each second ({found.lag_s:.3f} s is the best constant);"
-        f" set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
+        f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
+        f" constant); set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
     )
     edited = edit_field(description, "imu.time.offset", offset)
     return finding, edit_field(edited, "imu.time.scale", factor)

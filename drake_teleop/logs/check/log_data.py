@@ -24,7 +24,7 @@ from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
 _THINNED_RATE_HZ = 100.0
-_TIME_PREFIX = "thinned time stamps of"
+_THIN_TIME_PREFIX = "thinned time stamps of"
 
 
 class LogData:
@@ -54,7 +54,7 @@ class LogData:
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
-                column = {"column": f"{_TIME_PREFIX} {name}", "unit": "s"}
+                column = {"column": f"{_THIN_TIME_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
@@ -96,7 +96,7 @@ class LogData:
         table, rows = self._table_of_stream(stream), None
         if getattr(stream, "time", None) is not None:
             t, rows = self._times_and_rows(stream)
-            thin.columns[f"{_TIME_PREFIX} {name}"] = _means_of_consecutive_rows(t[:, None], k)
+            thin.columns[f"{_THIN_TIME_PREFIX} {name}"] = _means_of_consecutive_rows(t[:, None], k)
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
@@ -113,11 +113,11 @@ def _means_of_consecutive_rows(x: Array, k: int) -> Array:
     return x[: rows * k].reshape(rows, k, -1).mean(axis=1) if k > 1 else x
 
 
-_CHECKED_FIELDS = {
+_CHECKED_FIELDS_OF_STREAM = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
-_MIN_LIVE_NOISE_SHARE = 1e-6
+_MIN_LIVE_NOISE_OVER_SPREAD = 1e-6
 
 
 def channel_findings(
@@ -127,7 +127,7 @@ def channel_findings(
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
-    for field in _CHECKED_FIELDS[stream]:
+    for field in _CHECKED_FIELDS_OF_STREAM[stream]:
         quantity = getattr(described, field, None)
         if quantity is None:
             continue
@@ -170,7 +170,7 @@ def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -
 def _dead_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise_deviations(np.stack(list(numbers.values()), axis=1))
-    alive = noise > _MIN_LIVE_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
+    alive = noise > _MIN_LIVE_NOISE_OVER_SPREAD * (np.array(list(spread.values())) + 1e-300)
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []

@@ -21,25 +21,25 @@ from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_O
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
-_CUTOFF_HZ = 3.0
-_MAX_CONDITION_NUMBER = 1e8
-_MIN_REPORTED_SHIFT_M, _MAX_SHIFT_DEVIATION_M = 0.02, 0.01  # m
-_SIGNIFICANT_DEVIATIONS = 5.0  # standard deviations
-_UNIT_RATIO_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
+_ACCELERATION_CUTOFF_HZ = 3.0
+_MAX_SHIFT_FIT_CONDITION_NUMBER = 1e8
+_MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
+_MIN_ERROR_OVER_DEVIATION = 5.0  # standard deviations
+_UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 MIN_POSES_DURATION_S = 4.0
 """Shorter records have too few frequencies for an estimate by poses alone [s]."""
-_MAX_SCALE_ERROR_FOR_FRAME, _MIN_COM_DISTANCE_M, _MAX_COM_DISTANCE_M = 0.1, 2e-4, 1.5  # 1, m, m
-_TORQUE_UNITS = ("N m", "N mm", "lbf in")
+_MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
+_CONFUSED_TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _WRONG_TORQUE_UNIT_RATIOS = (
     *(
         SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
-        for unit, other in permutations(_TORQUE_UNITS, 2)
+        for unit, other in permutations(_CONFUSED_TORQUE_UNITS, 2)
     ),
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_COM_TOLERANCE = 0.03
+_TORQUE_UNIT_COM_TOLERANCE = 0.03
 
 
 def position_findings(description: Description, data: LogData, lag: float) -> list[Finding]:
@@ -65,12 +65,12 @@ def position_findings(description: Description, data: LogData, lag: float) -> li
     turning = np.stack([cross_matrix(w) @ cross_matrix(w) for w in omega])
     turning += np.stack([cross_matrix(x) for x in alpha])
     columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
-    columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF_HZ) for x in (columns, by_pose))
+    columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     fit = _fit_centred_signals(
-        columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0])
+        columns[inner], by_pose[inner], 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
     )
-    if fit is None or abs(fit[0][0]) <= _SIGNIFICANT_DEVIATIONS * fit[1][0]:
+    if fit is None or abs(fit[0][0]) <= _MIN_ERROR_OVER_DEVIATION * fit[1][0]:
         return []
     x, deviations = fit
     k = float(x[0])
@@ -79,9 +79,9 @@ def position_findings(description: Description, data: LogData, lag: float) -> li
         return [unit]
     shift, deviation = x[1:] / k, float(np.linalg.norm(deviations[1:]))
     size = float(np.linalg.norm(shift))
-    if abs(k - 1.0) > _MAX_SCALE_ERROR_FOR_SHIFT or deviation > _MAX_SHIFT_DEVIATION_M:
+    if abs(k - 1.0) > _MAX_SCALE_ERROR_FOR_SHIFT or deviation > _MAX_POSE_SHIFT_DEVIATION_M:
         return []
-    if size < max(_MIN_REPORTED_SHIFT_M, _SIGNIFICANT_DEVIATIONS * deviation):
+    if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_ERROR_OVER_DEVIATION * deviation):
         return []
     place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
     text = (
@@ -93,12 +93,12 @@ def position_findings(description: Description, data: LogData, lag: float) -> li
 
 
 def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding | None:
-    if not abs(kappa) > _SIGNIFICANT_DEVIATIONS * deviation:
+    if not abs(kappa) > _MIN_ERROR_OVER_DEVIATION * deviation:
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
-        if unit != now and _UNIT_RATIO_RANGE[0] < kappa / ratio < _UNIT_RATIO_RANGE[1]:
+        if unit != now and _UNIT_MATCH_RANGE[0] < kappa / ratio < _UNIT_MATCH_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
@@ -120,7 +120,7 @@ def _fit_centred_signals(
     if (size == 0.0).any():
         return None
     gram = (A / size).T @ (A / size)
-    if np.linalg.cond(gram) > _MAX_CONDITION_NUMBER:
+    if np.linalg.cond(gram) > _MAX_SHIFT_FIT_CONDITION_NUMBER:
         return None
     inverse = np.linalg.inv(gram)
     x = inverse @ ((A / size).T @ b)
@@ -157,7 +157,7 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
     unit = abs(seen.position_unit_ratio - 1.0) > max(
-        _MAX_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_deviation
+        _MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_deviation
     )
     if (
         unit
@@ -188,6 +188,6 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
 def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS]
-    return not _MIN_COM_DISTANCE_M < size < _MAX_COM_DISTANCE_M or bool(
-        min(off) < _COM_TOLERANCE * size
+    return not _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M or bool(
+        min(off) < _TORQUE_UNIT_COM_TOLERANCE * size
     )

@@ -65,10 +65,10 @@ from drake_teleop.logs.read.reading import read_description
 # Episodes that determine load, lag and noise: fewer if they are long.
 _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_FRAMES = 12_000
-_MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
+_MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_EXCESS_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
-_CONTACT_MARGIN_FRAMES, _MIN_FRAMES_FOR_OFFSETS = 2, 20
+_MAX_UNEXPLAINED_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
@@ -77,7 +77,7 @@ class EpisodeTask(NamedTuple):
 
     dataset: Dataset
     streams: dict[str, Any]
-    shared: SharedLoad
+    shared_load: SharedLoad
 
 
 def dataset_command(
@@ -119,7 +119,7 @@ def dataset_command(
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
         task = EpisodeTask(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
-        columns = [_read_new_columns(work / f"{k}.npy") for k in range(len(rows))]
+        columns = [_read_judged_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
@@ -216,7 +216,7 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
             where=f"{episode.file.name}: {episode.name}",
             remedy="give a --description, see docs/robot-learning.md",
         )
-    for _ in range(_MAX_CORRECTIONS):
+    for _ in range(_MAX_DRAFT_CORRECTIONS):
         described = _description_of_episode(streams, episode, dataset.fps)
         try:
             found = check_conventions(described, str(episode.file), {episode.file: table}).findings
@@ -225,7 +225,7 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
         fields = next((x for x in found if x.fields and "time" not in str(x.fields)), None)
         if fields is None:
             break
-        draft = draft.corrected(fields)
+        draft = draft.with_finding_corrected(fields)
         streams = _remove_file_names(draft, dataset.fps)
     return streams
 
@@ -322,13 +322,13 @@ def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
     write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
 
 
-def _read_new_columns(path: Path) -> NewColumns:
+def _read_judged_columns(path: Path) -> NewColumns:
     values = np.load(path, allow_pickle=False)
     return NewColumns(values[:, :6], values[:, 6] > 0.5)
 
 
 def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
-    shared = task.shared
+    shared = task.shared_load
     log, at = _read_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
     predict = signals.reading_predictor(shared.phi)
@@ -350,7 +350,7 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         0
     ] - np.log(shared.usual_half_widths)
     spread -= np.log(found.gain).repeat(3)
-    if not faults and spread.mean() > _MAX_EXCESS_LOG_SPREAD:
+    if not faults and spread.mean() > _MAX_UNEXPLAINED_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
@@ -380,7 +380,7 @@ def _contact_wrench_and_flags(
         detector = ContactDetector(shared.noise_floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
         free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
-        if free.sum() < _MIN_FRAMES_FOR_OFFSETS:
+        if free.sum() < _MIN_FREE_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)
     return contact, touched

@@ -30,7 +30,7 @@ from drake_teleop.logs.read.table_files import (
 )
 from drake_teleop.logs.read.tables import Table
 
-CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
+CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN = "observation.contact_wrench", "observation.in_contact"
 _TABLE_SUFFIXES = (".csv", ".tsv", ".parquet")
 _ZARR_METADATA_NAMES = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
 _LEROBOT_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -41,7 +41,7 @@ class Episode(NamedTuple):
 
     name: str
     file: Path
-    first: int
+    first_row: int
     rows: int
     group: str = ""
 
@@ -64,7 +64,7 @@ class Dataset(NamedTuple):
     def read_episode(self, episode: Episode) -> Table:
         if self.kind == "tables":
             return read_table(episode.file)
-        rows = slice(episode.first, episode.first + episode.rows)
+        rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
             if self.kind == "hdf5":
                 return Table(
@@ -74,13 +74,13 @@ class Dataset(NamedTuple):
             if self.kind == "zarr":
                 arrays = read_zarr(episode.file / "data", rows=rows)
                 return Table(episode.file, _with_element_columns(arrays))
-            frame = _numeric_frame(episode.file, episode.file.stat().st_mtime_ns)
-            part = frame.slice(episode.first, episode.rows)
+            frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
+            part = frame.slice(episode.first_row, episode.rows)
             return Table(episode.file, numeric_and_nested_columns(part))
 
 
 @lru_cache(maxsize=1)
-def _numeric_frame(file: Path, modified_ns: int) -> Any:
+def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
     """Return the columns of a Parquet file without text and images; the last file is kept."""
     import polars as pl
 
@@ -206,8 +206,8 @@ def _write_parquet(path: Path, target: Path, new: NewColumns) -> None:
     import polars as pl
 
     frame = pl.read_parquet(path)
-    wrench = pl.Series(CONTACT_WRENCH, np.ascontiguousarray(new.contact_wrench, np.float32))
-    frame = frame.with_columns(wrench.arr.to_list(), pl.Series(IN_CONTACT, new.in_contact))
+    wrench = pl.Series(CONTACT_WRENCH_COLUMN, np.ascontiguousarray(new.contact_wrench, np.float32))
+    frame = frame.with_columns(wrench.arr.to_list(), pl.Series(IN_CONTACT_COLUMN, new.in_contact))
     kept = {k: v for k, v in pl.read_parquet_metadata(path).items() if k != "ARROW:schema"}
     if "huggingface" in kept:
         kept["huggingface"] = _add_features_to_metadata(kept["huggingface"])
@@ -219,11 +219,11 @@ def _add_features_to_metadata(text: str) -> str:
     features = data.get("info", {}).get("features", {})
     lists = [x for x in features.values() if isinstance(x, dict) and "feature" in x]
     like: dict[str, Any] = copy.deepcopy(lists[0]) if lists else {"_type": "List"}
-    features[CONTACT_WRENCH] = like | {
+    features[CONTACT_WRENCH_COLUMN] = like | {
         "feature": {"dtype": "float32", "_type": "Value"},
         "length": -1,
     }
-    features[IN_CONTACT] = {"dtype": "bool", "_type": "Value"}
+    features[IN_CONTACT_COLUMN] = {"dtype": "bool", "_type": "Value"}
     return json.dumps(data)
 
 
@@ -239,7 +239,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
             remedy="convert it to Parquet",
         )
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
-    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT]
+    names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
     texts = {head: names} | {
         k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
@@ -279,12 +279,12 @@ def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
 
 def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewColumns]) -> None:
     info = json.loads((source / "info.json").read_text(encoding="utf-8"))
-    info["features"][CONTACT_WRENCH] = {
+    info["features"][CONTACT_WRENCH_COLUMN] = {
         "dtype": "float32",
         "shape": [6],
         "names": list(WRENCH_COLUMNS),
     }
-    info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
+    info["features"][IN_CONTACT_COLUMN] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
     write_text(target / "info.json", json.dumps(info, indent=4, ensure_ascii=False))
     if not (source / "stats.json").is_file():
@@ -295,8 +295,8 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
     )
     with_quantiles = any("q50" in x for x in stats.values())
     for name, values in (
-        (CONTACT_WRENCH, new.contact_wrench),
-        (IN_CONTACT, new.in_contact[:, None]),
+        (CONTACT_WRENCH_COLUMN, new.contact_wrench),
+        (IN_CONTACT_COLUMN, new.in_contact[:, None]),
     ):
         x = values.astype(float)
         parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}

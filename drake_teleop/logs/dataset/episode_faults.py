@@ -15,9 +15,9 @@ _UNITS_OF_QUANTITIES = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
-_UNIT_FACTOR_TOLERANCE, _MIN_GAIN_ERROR = 0.04, 0.06
-_MIN_ROTATION_DEG = 4.0
-_MIN_LAG_FRAMES = 0.6  # frames
+_UNIT_FACTOR_TOLERANCE, _MIN_UNIT_FACTOR_ERROR = 0.04, 0.06
+_MIN_WRENCH_ROTATION_DEG = 4.0
+_MIN_UNUSUAL_LAG_FRAMES = 0.6  # frames
 _MIN_SATURATED_FRAMES = 4
 
 
@@ -51,7 +51,7 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
         found += _rotation_faults(x.torque_axes, "the torque")
     found += _unit_faults(x.gain)
     late = x.lag - usual_lag
-    if abs(late) >= _MIN_LAG_FRAMES:
+    if abs(late) >= _MIN_UNUSUAL_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"
         text = f"the motion is {abs(late):.1f} frames ({abs(late) / fps:.3f} s) {side} the wrench"
         found.append(EpisodeFault("lag", f"{text}, compared with the other episodes", late))
@@ -71,7 +71,7 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
         M = -M
     turn = Rotation.from_matrix(M).as_rotvec(degrees=True)
     angle = float(np.linalg.norm(turn))
-    if angle > _MIN_ROTATION_DEG:
+    if angle > _MIN_WRENCH_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
         text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
         found.append(EpisodeFault("frame", text, M.tolist()))
@@ -81,7 +81,7 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
 def _unit_faults(gain: Array) -> list[EpisodeFault]:
     found = []
     for factor, (what, si, names) in zip(gain, _UNITS_OF_QUANTITIES, strict=True):
-        if abs(factor - 1.0) < _MIN_GAIN_ERROR:
+        if abs(factor - 1.0) < _MIN_UNIT_FACTOR_ERROR:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
         near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_FACTOR_TOLERANCE

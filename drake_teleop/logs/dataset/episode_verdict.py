@@ -30,13 +30,13 @@ HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
-_FORCE, _TORQUE = slice(0, 3), slice(3, 6)
+_FORCE_CHANNELS, _TORQUE_CHANNELS = slice(0, 3), slice(3, 6)
 _REFITTED_ROWS_SHARE, _NUM_REFITS = 0.6, 4
 # Required reduction of the log spread, for each deviation.
-_COST_PER_DEVIATION, _COST_TIMES_FRAMES = 0.25, 40.0
-_NUM_START_PARTS = 4
-_MIN_HALF_WIDTH_SHARE = 0.3
-_INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
+_SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
+_NUM_START_FIT_PARTS = 4
+_MIN_HALF_WIDTH_OVER_TYPICAL = 0.3
+_MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
 _MAX_DEVIATION_OVER_NOISE = 1.5
 
@@ -103,7 +103,7 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _MIN_HALF_WIDTH_SHARE * typical)
+    search = HypothesisSearch(predict, regress, usual_lag, _MIN_HALF_WIDTH_OVER_TYPICAL * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
@@ -140,14 +140,14 @@ class HypothesisSearch:
         self.predict, self.regress = predict, regress
         self.usual_lag, self.floor = usual_lag, floor
         self.frames = len(predict("sensor", usual_lag)[0])
-        self.price = _COST_PER_DEVIATION + _COST_TIMES_FRAMES / self.frames
+        self.price = _SPREAD_COST_PER_FAULT + _SPREAD_COST_TIMES_FRAMES / self.frames
 
     def _reading_residual(self, x: Hypothesis) -> Array:
         return unexplained_reading(x, self.predict, self.regress)
 
     def with_spread_and_cost(self, x: Hypothesis) -> Hypothesis:
         spread, offsets = spread_and_centre_of_calm_half(self._reading_residual(x), self.floor)
-        cost = float(spread.sum()) + self.price * _weighted_number_of_deviations(x, self.usual_lag)
+        cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
     def _best_rows_of(self, x: Hypothesis) -> NDArray[np.bool_]:
@@ -157,7 +157,10 @@ class HypothesisSearch:
 
     def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
-        force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
+        force, torque = (
+            self.best_permutation(*both, channels)
+            for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
+        )
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
         yield self.with_spread_and_cost(
@@ -190,9 +193,9 @@ class HypothesisSearch:
 
     def start_rows(self) -> Iterator[NDArray[np.bool_]]:
         """Yield flags (N,) of frames for a first fit: all, then each quarter of the episode."""
-        at = np.arange(self.frames) * _NUM_START_PARTS // self.frames
+        at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
         yield at >= 0
-        for part in range(_NUM_START_PARTS):
+        for part in range(_NUM_START_FIT_PARTS):
             yield at == part
 
     def refit_to_best_rows(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
@@ -212,7 +215,7 @@ class HypothesisSearch:
             if scale:
                 ratio = [
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
-                    for c in (_FORCE, _TORQUE)
+                    for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
                 ]
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
@@ -282,7 +285,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
-    for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
+    for channels, factor in zip((_FORCE_CHANNELS, _TORQUE_CHANNELS), gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
         H += w[:, channels].T @ p[:, channels] * factor / size**2
     U, _, Vt = np.linalg.svd(H)
@@ -291,13 +294,13 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
 
 def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
-    for channels, M in ((_FORCE, x.force_axes), (_TORQUE, x.torque_axes)):
+    for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
 
 
-def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
+def _weighted_number_of_faults(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
@@ -327,7 +330,7 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
         centre = spread_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
-        return (np.abs(part - centre) <= _INLIER_DEVIATIONS * deviation).all(axis=1), centre
+        return (np.abs(part - centre) <= _MAX_INLIER_DEVIATIONS * deviation).all(axis=1), centre
 
     whole = inliers_and_centre(residual)[0].sum()
     best: tuple[int, int, Array, Array] | None = None
@@ -342,14 +345,14 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
         gain = int(first.sum() + second.sum() - whole)
         sharp = first[-2:].all() and second[:2].all()
         full = min(first.mean(), second.mean()) > 0.4
-        large = (np.abs(after - before) > _STEP_DEVIATIONS * deviation).any()
+        large = (np.abs(after - before) > _MIN_OFFSET_STEP_DEVIATIONS * deviation).any()
         if sharp and full and large and gain >= fewest // 2 and (best is None or gain > best[0]):
             best = gain, int(k), before, after
     return None if best is None else best[1:]
 
 
-_MIN_KNOT_SPACING_S = 0.04
-_MARGIN_FRAMES = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
+_MIN_POSE_KNOT_SPACING_S = 0.04
+_MOTION_MARGIN_FRAMES = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
 
 
 class Motion(NamedTuple):
@@ -374,12 +377,12 @@ class EpisodeSignals:
         self._splines = None
         if log.posed is not None:
             poses = log.posed.poses
-            spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_KNOT_SPACING_S)
+            spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_POSE_KNOT_SPACING_S)
             self._splines = PoseSplines(poses, spacing, smooth=True)
         grid = (
             np.arange(
-                -_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,
-                (len(log) + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME,
+                -_MOTION_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,
+                (len(log) + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME,
             )
             / LAG_STEPS_PER_FRAME
         )
@@ -399,10 +402,10 @@ class EpisodeSignals:
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) `lag` frames after each frame."""
-        step = round((lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME)
+        step = round((lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME)
         if (
-            abs(step - (lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME) < 1e-6
-            and abs(lag) < _MARGIN_FRAMES
+            abs(step - (lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME) < 1e-6
+            and abs(lag) < _MOTION_MARGIN_FRAMES
         ):
             rows = slice(step, step + LAG_STEPS_PER_FRAME * len(self.log), LAG_STEPS_PER_FRAME)
             return Motion(*(x[rows] for x in self._fine))

@@ -28,9 +28,9 @@ from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 # Log spread beyond that of an episode's own load.
-_MAX_COUNTED_EXCESS, _MAX_MEMBER_EXCESS = 6.0, 2.0
+_MAX_COUNTED_EXCESS_SPREAD, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0  # frames
-_FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
+_MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
 _THRESHOLD_OVER_LARGEST_LEVEL = 1.1  # over the largest level of free frames
 
 
@@ -71,11 +71,11 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         phi = min(
             candidates,
             key=lambda phi: (
-                _excess_log_spread(episodes, own, phi).clip(max=_MAX_COUNTED_EXCESS).sum()
+                _excess_log_spread(episodes, own, phi).clip(max=_MAX_COUNTED_EXCESS_SPREAD).sum()
             ),
         )
         for _ in range(2):
-            members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS
+            members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
             members = members if members.any() else np.ones(len(own), bool)
             load = _fit_load_to_members(episodes, own, members, phi)
             phi = load.phi
@@ -83,7 +83,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else usable_phi(load)[0]
-    members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS
+    members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
     usual = [_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
     lag = (
@@ -147,7 +147,7 @@ def _fit_load_to_members(
         x = _hypothesis_at_best_lag(episodes[k], phi, own[k].lag)
         r = unexplained_reading(x, episodes[k].reading_predictor(phi), episodes[k].regressor_at_lag)
         sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
-        rows = (np.abs(r - x.offsets) < _FREE_DEVIATIONS * sigma).all(axis=1)
+        rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episodes[k].regressor_at_lag(x.lag)[rows], episodes[k].log.wrench[rows]
         A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
         b = ((w - w.mean(axis=0)) / sigma).ravel()
@@ -186,7 +186,7 @@ def _contact_free_samples(
     residual = (
         unexplained_reading(x, signals.reading_predictor(phi), signals.regressor_at_lag) - x.offsets
     )
-    far = (np.abs(residual) > _FREE_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
+    far = (np.abs(residual) > _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
     near = np.convolve(far, np.ones(2 * _CONTACT_MARGIN_FRAMES + 1), "same") > 0.5
     return samples_for_detector(signals, x.lag, residual).select_rows(~near)
 

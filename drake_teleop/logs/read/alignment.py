@@ -16,10 +16,10 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_ALIGNED_SAMPLES = 8
+_MIN_SAMPLES_AFTER_DELAY = 8
 _INTERPOLATED_CHUNK_ROWS = 2**18
-_MIN_WINDOW_SAMPLES = 9
-_POLYNOMIAL_DEGREE = 5
+_MIN_SMOOTHER_WINDOW_SAMPLES = 9
+_SMOOTHER_DEGREE = 5
 SMOOTHER_WINDOW_OVER_PERIOD = 1.8
 """Window length [s] of the smoother times its bandwidth [Hz]."""
 
@@ -115,10 +115,10 @@ def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
 def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
     """Return weights (6, w) that map w <= n samples to the coefficients of their polynomial."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
-    half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
-    powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
+    half = max(_MIN_SMOOTHER_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
+    powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
     # The interval -1 ... 1 makes the fit well-conditioned; then scale to seconds.
-    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_POLYNOMIAL_DEGREE + 1)[:, None]
+    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_SMOOTHER_DEGREE + 1)[:, None]
 
 
 def _evaluate_polynomial_derivatives(coefficients: list[Array], tau: Array, order: int) -> Array:
@@ -171,10 +171,10 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _MIN_ALIGNED_SAMPLES:
+    if known.sum() < _MIN_SAMPLES_AFTER_DELAY:
         raise DrakeTeleopError(
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples"
-            f" ({_MIN_ALIGNED_SAMPLES} are required)",
+            f" ({_MIN_SAMPLES_AFTER_DELAY} are required)",
             where=log.source,
             remedy="give a shorter delay, or `auto`",
         )
@@ -255,7 +255,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
-    return _refine_shift(cost, float(shifts[best]), step)
+    return _refine_delay_shift(cost, float(shifts[best]), step)
 
 
 def choose_delay(
@@ -277,7 +277,7 @@ def choose_delay(
     return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
-def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> float:
+def _refine_delay_shift(cost: Callable[[float], float], best: float, step: float) -> float:
     while step > 1e-5:
         step /= 4
         candidates = best + step * np.arange(-4, 5)

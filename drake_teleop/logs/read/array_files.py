@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 
-_MAX_ARRAY_NUMBERS, _MAX_NUMBERS_PER_ROW = 2**28, 64  # arrays with wider rows are images
+_MAX_NUMBERS_PER_ARRAY, _MAX_NUMBERS_PER_ROW = 2**28, 64  # arrays with wider rows are images
 
 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
@@ -63,9 +63,9 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
         or math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW
     ):
         return False
-    if math.prod(shape) > _MAX_ARRAY_NUMBERS:
+    if math.prod(shape) > _MAX_NUMBERS_PER_ARRAY:
         raise ValueError(
-            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_ARRAY_NUMBERS:.2g})"
+            f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_NUMBERS_PER_ARRAY:.2g})"
         )
     return True
 
@@ -82,18 +82,18 @@ def import_optional_module(name: str, path: Path) -> Any:
 
 
 _MAT_HEADER_BYTES = 128
-_MATRIX_TYPE = 14
-_COMPRESSED_TYPE = 15
-_STRUCTURE_CLASS = 2
-_COMPLEX_FLAG = 1 << 11
-_MAX_STRUCTURE_DEPTH = 20
+_MAT_MATRIX_TYPE = 14
+_MAT_COMPRESSED_TYPE = 15
+_MAT_STRUCTURE_CLASS = 2
+_MAT_COMPLEX_FLAG = 1 << 11
+_MAX_MAT_STRUCTURE_DEPTH = 20
 _MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _DTYPE_OF_MAT_TYPE = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
     13: "u8",
 }
-_FLAGS_AND_SIZE_TYPES = [6, 5]
+_MAT_FLAGS_AND_SIZE_TYPES = [6, 5]
 _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 
@@ -132,29 +132,29 @@ def _iterate_mat_elements(data: memoryview, order: str) -> Iterator[tuple[int, m
         content = data[start + begin : start + begin + size]
         if len(content) < size or (small and size > 4):
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        if kind == _COMPRESSED_TYPE:
+        if kind == _MAT_COMPRESSED_TYPE:
             yield from _iterate_mat_elements(memoryview(zlib.decompress(content)), order)
         else:
             yield kind, content
-        start += 8 if small else 8 + (size if kind == _COMPRESSED_TYPE else -(-size // 8) * 8)
+        start += 8 if small else 8 + (size if kind == _MAT_COMPRESSED_TYPE else -(-size // 8) * 8)
 
 
 def _add_mat_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    parts = list(_iterate_mat_elements(content, order)) if kind == _MATRIX_TYPE else []
+    parts = list(_iterate_mat_elements(content, order)) if kind == _MAT_MATRIX_TYPE else []
     # Objects have no size.
-    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE_TYPES:
+    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _MAT_FLAGS_AND_SIZE_TYPES:
         return
-    if depth > _MAX_STRUCTURE_DEPTH:
+    if depth > _MAX_MAT_STRUCTURE_DEPTH:
         raise ValueError(_DAMAGED_FILE_MESSAGE)
     (flags, *_), size = (_parse_mat_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _COMPLEX_FLAG:
+    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _MAT_COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
         _add_array(name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found)
-    elif flags & 0xFF == _STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
+    elif flags & 0xFF == _MAT_STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
         for field, part in zip(fields, parts[5:], strict=True):

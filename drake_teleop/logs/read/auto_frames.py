@@ -18,7 +18,7 @@ from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
-MIN_LAG_OF_WARNING_S = 0.05
+MIN_WARNED_IMU_LAG_S = 0.05
 """Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
@@ -94,7 +94,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
     ]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
-    if abs(found.lag_s) > MIN_LAG_OF_WARNING_S:
+    if abs(found.lag_s) > MIN_WARNED_IMU_LAG_S:
         notes.append(
             f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
             f" add {-found.lag_s:.3f} to imu.time.offset to correct it"
@@ -105,7 +105,7 @@ def _imu_rotation_notes(found: Mounting) -> list[str]:
 def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     lever = None
     if mounting is not None and mounting.fits_pose:
-        lever = mounting.lever
+        lever = mounting.lever_arm
     if lever is None or not lever.is_determined_by_axis.all():
         other = lever_arm_from_wrench(at_Io)
         if lever is None or (
@@ -214,7 +214,7 @@ def wrench_of_weight(weight: Array, gravity: Array) -> Array:
     return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
 
 
-def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
+def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
 
     The delay is estimated from `motion_log`, the same log with motion, and removed.
@@ -230,7 +230,7 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     )
 
 
-_MAX_GRAVITY_STD_DEG = 2.0
+_MAX_GRAVITY_DIRECTION_STD_DEG = 2.0
 
 
 def estimate_auto_gravity(
@@ -251,7 +251,7 @@ def estimate_auto_gravity(
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
         spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
         deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
-    if not deviation < _MAX_GRAVITY_STD_DEG:
+    if not deviation < _MAX_GRAVITY_DIRECTION_STD_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
-_MAX_ARRAY_LENGTH = 64
-_MESSAGES_PER_BLOCK, _RECEPTION_COLUMN = 10_000, "received at"
+_MAX_MESSAGE_ARRAY_LENGTH = 64
+_MESSAGES_PER_BLOCK, _RECEPTION_TIME_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
-_MAX_ADDED_MEMORY_BYTES = 1_500_000_000  # bytes
+_MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_FIELDS = (
+_VECTOR_MESSAGE_FIELDS = (
     "force",
     "torque",
     "linear_acceleration",
@@ -44,8 +44,8 @@ _VECTOR_FIELDS = (
     "orientation",
     "position",
 )
-_VECTOR_OF_FIELD = {name: name for name in _VECTOR_FIELDS}
-_VECTOR_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
+_VECTOR_OF_MESSAGE_FIELD = {name: name for name in _VECTOR_MESSAGE_FIELDS}
+_VECTOR_OF_MESSAGE_FIELD |= {"rotation": "orientation", "translation": "position"}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -103,7 +103,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     columns = _join_blocks(blocks)
-    received = columns.pop(_RECEPTION_COLUMN)
+    received = columns.pop(_RECEPTION_TIME_COLUMN)
     absent = _remove_fields_marked_absent(columns)
     columns |= _short_column_names(columns)
     columns["received"] = received
@@ -212,7 +212,7 @@ def _limit_process_memory() -> Iterator[None]:
     except OSError:  # only Linux enforces this limit
         yield
         return
-    limit = pages * resource.getpagesize() + _MAX_ADDED_MEMORY_BYTES
+    limit = pages * resource.getpagesize() + _MAX_ADDED_PROCESS_MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit if soft < 0 else min(limit, soft), hard))
     try:
         yield
@@ -234,7 +234,7 @@ def _read_column_blocks(
 
     found = messages_of_child_frame()
     while block := list(itertools.islice(found, _MESSAGES_PER_BLOCK)):
-        received = {_RECEPTION_COLUMN: np.array([time for time, _ in block]) * 1e-9}
+        received = {_RECEPTION_TIME_COLUMN: np.array([time for time, _ in block]) * 1e-9}
         blocks.append(_columns_of_messages([part for _, part in block]) | received)
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
         named = ", ".join(sorted(filter(None, children)))
@@ -278,7 +278,7 @@ def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
         if hasattr(value, "nanosec") or isinstance(value, (bool, int, float, np.number)):
             yield path, value
         elif isinstance(value, np.ndarray):
-            if value.dtype.kind in "fiu" and 0 < len(value) <= _MAX_ARRAY_LENGTH:
+            if value.dtype.kind in "fiu" and 0 < len(value) <= _MAX_MESSAGE_ARRAY_LENGTH:
                 yield path, value
         elif dataclasses.is_dataclass(value):
             yield from _numeric_fields(value, f"{path}.")
@@ -299,6 +299,6 @@ def _short_column_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _VECTOR_OF_FIELD and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_VECTOR_OF_FIELD[group]}.{axis}", []).append(path)
+        if group in _VECTOR_OF_MESSAGE_FIELD and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_VECTOR_OF_MESSAGE_FIELD[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

@@ -35,7 +35,7 @@ _KINEMATIC_COLUMNS = {
 }
 _MAX_REST_SPEED_RAD_S = 0.05  # rad/s
 _MIN_TURN_BETWEEN_POSES_RAD = np.radians(10.0)
-_ROW_SHAPES: dict[str, tuple[int, ...]] = {
+_ROW_SHAPE_OF_FIELD: dict[str, tuple[int, ...]] = {
     "t": (),
     "wrench": (6,),
     "specific_force": (3,),
@@ -94,7 +94,7 @@ class Log:
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, row_shape in _ROW_SHAPES.items():
+        for name, row_shape in _ROW_SHAPE_OF_FIELD.items():
             value, shape = getattr(self, name), (len(self.t), *row_shape)
             if value is None:
                 continue
@@ -140,7 +140,7 @@ class Log:
     def select_rows(self, rows: slice | NDArray[np.bool_]) -> Log:
         if not isinstance(rows, slice) and rows.all():
             return self
-        arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
+        arrays = {name: getattr(self, name) for name in _ROW_SHAPE_OF_FIELD}
         selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
         return replace(self, **selected)
 

@@ -25,7 +25,7 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
-_MIN_DRIFT_LIKELIHOOD_GAIN, _MIN_DRIFT_S = 50.0, 0.01
+_MIN_CLOCK_DRIFT_LIKELIHOOD_GAIN, _MIN_CLOCK_DRIFT_S = 50.0, 0.01
 SignalPairs = list[tuple[Array, Array]]
 """Signal of the pose and of the IMU, for each sensor, see `signal_pairs_of_pose_and_imu`."""
 
@@ -98,7 +98,7 @@ def estimate_clock_drift(
         found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
     gain = independent * np.log(start / (cost + 1e-300))
     total_drift_s = abs(found[1]) * float(t[-1] - t[0])
-    if gain < _MIN_DRIFT_LIKELIHOOD_GAIN or total_drift_s < _MIN_DRIFT_S:
+    if gain < _MIN_CLOCK_DRIFT_LIKELIHOOD_GAIN or total_drift_s < _MIN_CLOCK_DRIFT_S:
         return lag, 0.0
     return float(found[0]), float(found[1])
 
@@ -113,8 +113,8 @@ def _unexplained_share(y: Array, x: Array) -> float:
 
 _NUM_JACKKNIFE_BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.
-MIN_SINGULAR_RATIO = 1e-5
-_MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
+MIN_SINGULAR_VALUE_RATIO = 1e-5
+_MAX_RESIDUAL_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
 def nonlinear_least_squares(
@@ -149,7 +149,7 @@ def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Arr
         return np.hstack([found, known])
 
     return least_squares(
-        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS
+        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_RESIDUAL_EVALUATIONS
     )
 
 
@@ -157,7 +157,7 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     """Return jackknife standard deviations (n,) of the parameters, for blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
-    known = singular > MIN_SINGULAR_RATIO * singular[0]
+    known = singular > MIN_SINGULAR_VALUE_RATIO * singular[0]
     basis = Vt[known].T
     J = (jacobian / size) @ basis
     gram, steps = J.T @ J, []
@@ -170,16 +170,16 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     return np.where(unknown, np.inf, deviations)
 
 
-MAX_LEVER_DEVIATION_M = 0.005
+MAX_LEVER_ARM_DEVIATION_M = 0.005
 """Largest standard deviation of a determined coordinate [m]."""
 MAX_UNEXPLAINED_SHARE = 0.05
 """Largest unexplained share of the variance of a valid fit."""
-COMPARISON_CUTOFF_HZ = 8.0
+IMU_COMPARISON_CUTOFF_HZ = 8.0
 """Cut-off of the low-pass on all signals [Hz]."""
 MAX_COMPARED_SAMPLES = 1500
 """Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
-_MIN_SIGNAL_OVER_NOISE_POWER = 20.0
+_MIN_MOTION_OVER_NOISE_POWER = 20.0
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class LeverArm:
     @property
     def is_determined_by_axis(self) -> NDArray[np.bool_]:
         """Booleans (3,): True where the standard deviation is below 5 mm."""
-        return self.deviations < MAX_LEVER_DEVIATION_M
+        return self.deviations < MAX_LEVER_ARM_DEVIATION_M
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
@@ -207,7 +207,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
     Return None for a poor fit (contact), or few samples outside of gaps.
     """
-    cutoff = min(COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
+    cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
     smooth = low_pass_log(remove_delay(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
@@ -226,7 +226,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     size = np.linalg.norm(V - V.mean(axis=0), axis=(0, 1)) + 1e-12
     centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
     target = (wrench - wrench.mean(axis=0)).ravel()
-    phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_RATIO)[0] / size
+    phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_VALUE_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
     x, deviations = nonlinear_least_squares(
         residual_at, np.concatenate([np.zeros(4), offsets, phi])
@@ -258,7 +258,7 @@ def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
     alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
-    return alone > _MIN_SIGNAL_OVER_NOISE_POWER * (noise.sum() - noise)
+    return alone > _MIN_MOTION_OVER_NOISE_POWER * (noise.sum() - noise)
 
 
 MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
@@ -267,7 +267,7 @@ MAX_ROTATION_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
 MAX_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
-_MAX_LAG_S = 1.0
+_MAX_IMU_LAG_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -279,26 +279,26 @@ class Mounting:
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
         mid_record_lag_s, mid_record_time_s: lag at mid-record, and this time on the pose's clock
             [s].
-        drift: growth of the lag [s/s]; 0 if insignificant.
+        clock_drift: growth of the lag [s/s]; 0 if insignificant.
         unexplained, unexplained_omega: unexplained shares of the variance of specific
             force and angular velocity (None without a gyroscope).
         is_mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
-        lever: position of the accelerometer; None without positions.
+        lever_arm: position of the accelerometer; None without positions.
     """
 
     R_SI: Array
     lag_s: float
     mid_record_lag_s: float
     mid_record_time_s: float
-    drift: float
+    clock_drift: float
     unexplained: float
     unexplained_omega: float | None
     is_mirrored: bool
     speed_ratio: float | None
     deviations_deg: Array
-    lever: LeverArm | None
+    lever_arm: LeverArm | None
 
     @property
     def rotation_angle_deg(self) -> float:
@@ -324,7 +324,7 @@ class Mounting:
         omega_agrees = (
             self.unexplained_omega is None or self.unexplained_omega < MAX_UNEXPLAINED_SHARE
         )
-        if self.lever is not None:
+        if self.lever_arm is not None:
             return (
                 not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
             )
@@ -345,8 +345,8 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
-    reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
-    cutoff = min(COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
+    reach = min(_MAX_IMU_LAG_S, 0.2 * float(stop - start))
+    cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
     sensed, smooth = low_pass_log(imu, cutoff), low_pass_log(pose, cutoff)
     t = times_outside_gaps(start + reach, stop - reach, (imu, pose), cutoff)
     if len(t) < MAX_COMPARED_SAMPLES // 10:
@@ -391,13 +391,13 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         lag_s=lag if drift else float(x[3]),
         mid_record_lag_s=float(x[3]),
         mid_record_time_s=centre,
-        drift=drift,
+        clock_drift=drift,
         unexplained=shares[0],
         unexplained_omega=shares[1] if len(shares) > 1 else None,
         is_mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
-        lever=lever,
+        lever_arm=lever,
     )
 
 

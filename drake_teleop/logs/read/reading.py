@@ -31,7 +31,7 @@ from drake_teleop.logs.read.auto_frames import (
     estimate_auto_gravity,
     estimate_auto_imu_mounting,
     estimate_auto_pose_frame,
-    restore_weight,
+    restore_removed_weight,
     wrench_of_weight,
 )
 from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream_table
@@ -52,10 +52,10 @@ from drake_teleop.logs.read.streams import (
     OrientationColumns,
     Stream,
     resample_to_clock,
+    rotate_world_to_S,
+    rotate_wrench_world_to_S,
     specific_force_at_So,
     uniform_times_of_streams,
-    world_to_S,
-    wrench_world_to_S,
 )
 from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table, decimal_resolution
@@ -63,7 +63,7 @@ from drake_teleop.logs.read.tables import Table, decimal_resolution
 MIN_STATIC_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
-_MIN_GAP_OVER_STEP = 4.0
+_MIN_IMU_GAP_OVER_STEP = 4.0
 _EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
@@ -176,7 +176,7 @@ class _LogReader:
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restore_weight(log, np.array(weight), self._read_edited_log(other))
+        return restore_removed_weight(log, np.array(weight), self._read_edited_log(other))
 
     def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
         read = partial(self._read_edited_log, differentiate=differentiate)
@@ -242,7 +242,7 @@ class _LogReader:
         return Stream(
             "pose",
             t,
-            world_to_S(R_WS, acceleration - self._description.gravity_W),
+            rotate_world_to_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
             raw,
@@ -296,7 +296,7 @@ class _LogReader:
         if s is not None and any(stream.position):
             s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_GAP_OVER_STEP * dt  # outside of gaps
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _MIN_IMU_GAP_OVER_STEP * dt  # outside of gaps
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, imu_data=ImuData(t[outside_gaps], *both))
 
@@ -309,7 +309,7 @@ class _LogReader:
             return vectors
         if pose is None or pose.R_WS is None:
             raise self._no_orientation_error(name)
-        return world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+        return rotate_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
     def _no_orientation_error(
         self, name: str, remedy: str = "add a pose stream"
@@ -340,7 +340,7 @@ class _LogReader:
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
                 raise self._no_orientation_error("static", remedy)
-            wrench = wrench_world_to_S(R_SW, wrench)
+            wrench = rotate_wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
@@ -395,16 +395,16 @@ class _LogReader:
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half = self._half_window_s(float(np.median(np.diff(t))))
+            half = self._half_smoother_window_s(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
-    def _half_window_s(self, dt: float) -> float:
+    def _half_smoother_window_s(self, dt: float) -> float:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
     def _include_window_in_one_sided_ends(self, dt: float) -> None:
-        self._one_sided_s = max(self._one_sided_s, self._half_window_s(dt))
+        self._one_sided_s = max(self._one_sided_s, self._half_smoother_window_s(dt))
 
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal_on_clock(field: str) -> Array:
@@ -421,7 +421,7 @@ class _LogReader:
             R_WS = nearest_rotation(resample_to_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             if in_base:
-                wrench = wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = rotate_wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
             raise self._no_orientation_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None

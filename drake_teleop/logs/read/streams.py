@@ -64,11 +64,11 @@ def resample_to_clock(t: Array, stream: Stream, values: Array) -> Array:
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
-def world_to_S(R_WS: Array, vectors_W: Array) -> Array:
+def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
+def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)

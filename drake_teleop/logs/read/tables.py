@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-MAX_NUMBER = 1e25
+MAX_PLAUSIBLE_NUMBER = 1e25
 """Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
-_MAX_DECIMALS = 12
+_MAX_RESOLUTION_DECIMALS = 12
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Table:
         column = self.columns[name]
         numbers = _column_to_numbers(column, partial(self._cell_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
-        self.check_magnitude(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
+        self.check_magnitude(numbers, MAX_PLAUSIBLE_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
     def single_column(self, name: str | int, where: str) -> Array:
@@ -191,7 +191,7 @@ class Table:
 
 def decimal_resolution(values: Array) -> float:
     """Return the largest power of ten <= 1 of which all values are multiples, or 0."""
-    for decimals in range(_MAX_DECIMALS if values.any() else 0):
+    for decimals in range(_MAX_RESOLUTION_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
             return float(10.0**-decimals)
