@@ -16,7 +16,7 @@ from drake_teleop.lab.analysis.one_axis import Complex
 
 Array = NDArray[np.float64]
 
-_NUM_BISECTION_STEPS = 60
+_NUM_STIFFNESS_BISECTIONS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
@@ -42,7 +42,7 @@ def stable_stiffness(
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / held[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
-    for _ in range(_NUM_BISECTION_STEPS):
+    for _ in range(_NUM_STIFFNESS_BISECTIONS):
         middle = (low + high) / 2
         poles = sampled_poles(
             mass, damping, middle, wall_damping, period, hand_stiffness=hand_stiffness

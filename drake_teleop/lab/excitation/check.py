@@ -20,7 +20,7 @@ _SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _DIFFERENCE_STEP_S = 1e-4
 # Search distance beyond the clearance [m].
-_CLEARANCE_SEARCH_MARGIN_M = 0.01
+_SHAPE_PAIR_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _evaluate_motion(
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = robot.scene_graph.get_query_output_port().Eval(scene_context)
         distance, words = _nearest_shape_pair(
-            robot, query, limits.clearance + _CLEARANCE_SEARCH_MARGIN_M
+            robot, query, limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
         )
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)

@@ -26,11 +26,11 @@ CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
-_MASS_ERROR, _INERTIA_ERROR = 0.01, 0.1
-_COM_ERROR_M = 1e-3
-_OFFSET_ERRORS = (0.1, 0.005)
+_MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
+_MAX_COM_ERROR_M = 1e-3
+_MAX_OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
-_MIN_EIGENVALUE_RATIO = 1e-13
+_MIN_RATIO_OF_EXCITED_EIGENVALUES = 1e-13
 
 
 class CriterionScales(NamedTuple):
@@ -87,7 +87,7 @@ class Criterion:
         """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
         _, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
+        if eigenvalues[0] <= _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
@@ -100,7 +100,7 @@ class Criterion:
         """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
+        eigenvalues = np.maximum(eigenvalues, _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = (vectors * weights) @ vectors.T
         if self.name == "A16":
@@ -149,9 +149,16 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
 
 
 def _acceptable_errors(phi: Array) -> Array:
-    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_OFFSET_ERRORS, 3)
-    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
+    inertia = _MAX_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_MAX_OFFSET_ERRORS, 3)
+    return np.array(
+        [
+            *offsets,
+            _MAX_RELATIVE_MASS_ERROR * phi[0],
+            *3 * [_MAX_COM_ERROR_M * phi[0]],
+            *6 * [inertia],
+        ]
+    )
 
 
 def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:

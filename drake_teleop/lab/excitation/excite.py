@@ -31,9 +31,9 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
-_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
+_MOTION_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
-_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKS = 1.05, 30
+_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKED_CANDIDATES = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
 _FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
 _CONVEX_HULL_ADVICE = (
@@ -183,13 +183,13 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
         if iterate.criterion_value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start_index]:
             continue
         last[iterate.start_index] = iterate.criterion_value
-        for factor in _SHRINK_FACTORS:
+        for factor in _MOTION_SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_limit_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
-        if checks == _MAX_CHECKS:
+        if checks == _MAX_CHECKED_CANDIDATES:
             return
 
 

@@ -61,21 +61,21 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
 _MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
-_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO = 20, 1, 0.99
+_MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
 # Additional margin after a round that missed the tolerance.
-_FACTOR_MARGIN_AFTER_MISS = 1.005
+_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005
 # Number of rounds without any motion before the search fails.
 _MAX_ROUNDS_WITHOUT_MOTION = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.
-_MAX_MISFIT_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
+_MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 # Difference between the seeds of rounds.
-_SEED_STEP = 2**33
+_SEED_STEP_BETWEEN_ROUNDS = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
-_COEFFICIENT_SPREAD, _PERIOD_SPREAD = 0.2, 1.3
+_MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
 # Sharpness of the maximum over tolerances, relative to that over eigenvalues.
-_SHARPNESS_RATIO = 4.0
+_TOLERANCE_SHARPNESS_RATIO = 4.0
 # Regularisation of the balanced information; it is singular without motion.
-_REGULARISATION = 1e-11
+_INFORMATION_REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +110,11 @@ def design_shortest_motion(
     worst, around = np.inf, None
     best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
-    for k in range(_MAX_ROUNDS):
+    for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = minimise_criterion(
-            problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
+            problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
@@ -129,11 +129,13 @@ def design_shortest_motion(
         )
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _MAX_MISFIT_OF_VARIED_MOTION else None
+        around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
             vain_rounds = (
-                0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
+                0
+                if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
+                else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
@@ -144,7 +146,7 @@ def design_shortest_motion(
         new_factor = factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         factor = (
-            _FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
+            _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
             if worst > 1.0 and k > 0
             else new_factor
         )
@@ -192,9 +194,9 @@ class ShortestMotionProblem(DesignProblem):
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return the unknowns of a random motion; `near_home`: of one near the known motion."""
         if self._around is not None and near_home:
-            other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
+            other = _MAX_COEFFICIENT_VARIATION * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
-            x[-1] += np.log(_PERIOD_SPREAD) * rng.uniform(-1.0, 1.0)
+            x[-1] += np.log(_MAX_PERIOD_VARIATION_FACTOR) * rng.uniform(-1.0, 1.0)
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
@@ -225,7 +227,7 @@ class ShortestMotionProblem(DesignProblem):
         write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
+        use, worst, g_V = self._tolerance_use(_TOLERANCE_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
@@ -274,7 +276,7 @@ class ShortestMotionProblem(DesignProblem):
         G = share * (flat.T @ flat)
         B = share * (flat.T @ (self._noise @ rows).reshape(flat.shape))
         size = 1.0 / np.sqrt(np.diag(G))
-        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULARISATION * np.eye(16))
+        inverse = np.linalg.inv(G * np.outer(size, size) + _INFORMATION_REGULARISATION * np.eye(16))
         inverse *= np.outer(size, size)
         v = self._errors @ inverse
         Bv = v @ B
