@@ -27,7 +27,7 @@ from drake_teleop.station.slave.arm import (
 
 Array = NDArray[np.float64]
 
-_REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
+_SIGNALS_FOR_ENERGY_BALANCES = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
@@ -35,7 +35,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
     `MOTOR` is NaN if the log is slower than the joint control.
     """
-    if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
+    if missing := [name for name in _SIGNALS_FOR_ENERGY_BALANCES if name not in result]:
         raise DrakeTeleopError(
             f"lacks the signals {', '.join(missing)}, which the energy balances need",
             where="result",

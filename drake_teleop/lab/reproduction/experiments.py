@@ -28,7 +28,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_OVER_FREE_PEAK = 1.5
+_CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 _ALL_AXES_MOTION = Sine(
     duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
 )
@@ -107,7 +107,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
         measured_wrench_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_wrench_free=calculated_free,
         in_contact=is_in_contact(touched),
-        threshold_N=_THRESHOLD_OVER_FREE_PEAK * float(_force_norm(calculated_free).max()),
+        threshold_N=_CONTACT_THRESHOLD_OVER_FREE_PEAK * float(_force_norm(calculated_free).max()),
     )
 
 
@@ -181,8 +181,8 @@ def contact_values(run: ContactMotion) -> NamedValues:
     window = _contact_window(run)
     after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
     return {
-        "true_s": _first_time(t, run.in_contact),
-        "detected_s": _first_time(t, detected),
+        "true_s": _time_of_first_true(t, run.in_contact),
+        "detected_s": _time_of_first_true(t, detected),
         "threshold_N": run.threshold_N,
         "raw_detectable": bool(raw_force_beyond_free_range(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
@@ -283,5 +283,5 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _first_time(t: Array, happened: NDArray[np.bool_]) -> float | None:
+def _time_of_first_true(t: Array, happened: NDArray[np.bool_]) -> float | None:
     return float(t[np.argmax(happened)]) if happened.any() else None

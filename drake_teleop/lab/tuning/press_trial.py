@@ -46,8 +46,8 @@ TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N",
 _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
-_MAX_DEVICE_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
+_USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
+_LEAF_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
@@ -123,7 +123,7 @@ class StationTrial:
             task=task,
             depth=press_depth(self.base, grip),
         )
-        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
+        setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
@@ -139,8 +139,8 @@ class StationTrial:
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
-            rms_above(felt, period, REST_BAND_HZ),
-            *(rms_above(force, period, REST_BAND_HZ) for force in free_felt),
+            rms_above_hz(felt, period, REST_BAND_HZ),
+            *(rms_above_hz(force, period, REST_BAND_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
         human = self.base.operator.perception
@@ -239,7 +239,7 @@ class GammaSearch:
         )
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
+        quiet = rms_above_hz(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
@@ -263,10 +263,10 @@ def press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
-    return min(_MAX_PRESS_DEPTH_M, _MAX_DEVICE_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
+    return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
-def rms_above(x: Array, period: float, frequency: float) -> float:
+def rms_above_hz(x: Array, period: float, frequency: float) -> float:
     """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")

@@ -37,7 +37,7 @@ WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
-_BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
+_MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
 _MAX_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
@@ -92,7 +92,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         measures=SEARCH_MEASURES,
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
-    search = [_predict_threshold(row, trial, noises) for row in rows]
+    search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
@@ -147,7 +147,7 @@ def _find_gamma_limit_in_station(
         gamma, failed = gamma / 2, gamma
     if not inside:
         return gamma, []
-    while failed > _BISECTION_RATIO * gamma:
+    while failed > _MAX_UNSTABLE_OVER_STABLE_GAMMA * gamma:
         middle = float(np.sqrt(gamma * failed))
         if rows := run_at_gamma(middle):
             gamma, inside = middle, rows
@@ -180,10 +180,10 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = (trial.base.operator.perception, trial.base.force_scaling.force_scale)
-    masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
+    masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
@@ -191,7 +191,7 @@ def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _rms_load_force(trial: StationTrial) -> float:
+def _rms_load_force_in_swing(trial: StationTrial) -> float:
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
