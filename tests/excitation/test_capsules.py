@@ -11,7 +11,7 @@ from pydrake.geometry import Box, Cylinder, GeometryId
 from pydrake.geometry import Capsule as CapsuleShape
 
 from drake_teleop.lab.excitation.collision import (
-    CLEARANCE_M,
+    MIN_CLEARANCE_M,
     Capsule,
     _exclude_coaxial_pairs,
     _min_capsule_distance,
@@ -64,7 +64,7 @@ def test_minimum_distance_subtracts_the_quartile_of_the_excess():
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
     nearer = touching - np.linspace(0.0, 0.1, 101)
     kept = _min_capsule_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
-    assert kept == pytest.approx(CLEARANCE_M - 0.025)
+    assert kept == pytest.approx(MIN_CLEARANCE_M - 0.025)
     # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
     assert _min_capsule_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)

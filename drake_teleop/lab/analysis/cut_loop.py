@@ -41,9 +41,9 @@ class CutLoop:
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
     period_s: Array  #: period of the hand [s], (...)
     #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    crossing_angles: Array
-    crossing_phases: Array  #: unwrapped phases of L at these angles
-    crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
+    gain_crossing_angles: Array
+    gain_crossing_phases: Array  #: unwrapped phases of L at these angles
+    gain_crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
     def from_multipliers(
@@ -114,19 +114,19 @@ def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period_s)[..., None]
-    angles = loop.crossing_angles
-    turns = (loop.crossing_phases - D * angles) / (2 * np.pi)
+    angles = loop.gain_crossing_angles
+    turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
     outside = (np.abs(loop.open_multipliers) > 1 + _DISTANCE_OF_MULTIPLIER_FROM_ONE).sum(axis=-1)
-    return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
+    return outside - (loop.gain_crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
-    angles = loop.crossing_angles
-    inside = (angles > 0) & (angles < np.pi) & (loop.crossing_signs != 0)
-    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
+    angles = loop.gain_crossing_angles
+    inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)
+    steps = np.mod(loop.gain_crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
@@ -163,7 +163,9 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
-    crossings = np.where(radius > 0, radius * np.exp(1j * rescaled_loop(high).crossing_angles), 0)
+    crossings = np.where(
+        radius > 0, radius * np.exp(1j * rescaled_loop(high).gain_crossing_angles), 0
+    )
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
     found = np.zeros(z.shape, dtype=bool)

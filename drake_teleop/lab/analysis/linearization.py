@@ -343,8 +343,8 @@ class _PeriodSimulator:
         smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
-            _check_environment(self._diagram)
-            _remove_friction(self._diagram)
+            _check_linear_environment(self._diagram)
+            _remove_contact_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Error control would make the steps depend on the displacements.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
@@ -598,7 +598,7 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
     )
 
 
-def _check_environment(diagram: Diagram) -> None:
+def _check_linear_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
         raise DrakeTeleopError(
@@ -608,7 +608,7 @@ def _check_environment(diagram: Diagram) -> None:
         )
 
 
-def _remove_friction(diagram: Diagram) -> None:
+def _remove_contact_friction(diagram: Diagram) -> None:
     plant = GetBlock(diagram, "slave_plant")
     scene_graph = GetBlock(diagram, "scene_graph")
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()

@@ -21,7 +21,7 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
-(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER) = range(7)
+(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
 _MAX_RATE_OVER_HAND = 1000
@@ -59,7 +59,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
-    n = FIRST_FILTER + 2 * sections.shape[-2]
+    n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
     rows = _PeriodMapRows(axis, n + 3)
     hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
@@ -189,7 +189,7 @@ class _PeriodMapRows:
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
-            first, second = FIRST_FILTER + 2 * k, FIRST_FILTER + 2 * k + 1
+            first, second = FIRST_FILTER_STATE + 2 * k, FIRST_FILTER_STATE + 2 * k + 1
             filtered = b0 * value + self._make_row({first: 1.0})
             memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
             memory.append(b2 * value - a2 * filtered)

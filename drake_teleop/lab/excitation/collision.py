@@ -109,7 +109,7 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 
 
 #: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
-CLEARANCE_M = 0.005
+MIN_CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
 _NEIGHBOUR_TOUCHING_SHARE, _MIN_PAIR_DISTANCE_VARIATION_M = 0.95, 1e-3
@@ -199,8 +199,8 @@ class CollisionScene:
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
             constant = of_pair.max() < of_pair.min() + _MIN_PAIR_DISTANCE_VARIATION_M
-            neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_TOUCHING_SHARE
-            touch = start is not None and of_all[-1] < CLEARANCE_M
+            neighbours = constant or np.mean(of_pair < MIN_CLEARANCE_M) >= _NEIGHBOUR_TOUCHING_SHARE
+            touch = start is not None and of_all[-1] < MIN_CLEARANCE_M
             if touch and not neighbours:
                 frames = map(self.scene_graph.model_inspector().GetFrameId, (a, b))
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
@@ -252,14 +252,14 @@ class CollisionScene:
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
             distance = _min_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
-            near = shape_distances[a, b] < CLEARANCE_M
+            near = shape_distances[a, b] < MIN_CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
             if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
                 useful = (
                     near.any()
-                    or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_CONTACT_SHARE
+                    or 0 < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M) < _RARE_CONTACT_SHARE
                 )
             if useful:
                 used.append(k)
@@ -275,10 +275,10 @@ def _min_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
         if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT
         else np.zeros(1)
     )
-    free = capsules_apart[of_shapes > CLEARANCE_M]
+    free = capsules_apart[of_shapes > MIN_CLEARANCE_M]
     return float(
         min(
-            CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
+            MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
             np.quantile(free, _BLOCKABLE_POSTURE_SHARE),
         )
     )
@@ -290,7 +290,7 @@ def _exclude_coaxial_pairs(
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
-        if first.max() < min(CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
+        if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))

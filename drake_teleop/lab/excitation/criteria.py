@@ -23,7 +23,7 @@ from drake_teleop.load.regressor import regressor
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
 #: Sample rate of A16 and D16 [Hz].
-SAMPLE_RATE_HZ = 1000.0
+INFORMATION_SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
 _MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
@@ -92,7 +92,7 @@ class Criterion:
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(SAMPLE_RATE_HZ * duration))
+        return float(np.exp(log_value) / np.sqrt(INFORMATION_SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
@@ -121,8 +121,8 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, top_weights = _smooth_max(logs, sharpness)
-        bottom, bottom_weights = _smooth_max(-logs, sharpness)
+        top, top_weights = _smooth_maximum_and_weights(logs, sharpness)
+        bottom, bottom_weights = _smooth_maximum_and_weights(-logs, sharpness)
         return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
@@ -161,7 +161,7 @@ def _acceptable_errors(phi: Array) -> Array:
     )
 
 
-def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:
+def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()

@@ -129,7 +129,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
             for j in range(n):
                 x = values[t, j] - limits.q_middle[j] if k == 0 else values[t, j]
                 use[t, j], sign[t, j] = abs(x) / scale[j], np.sign(x) / scale[j]
-        largest[k], smooth[k] = _smooth_maximum(use, sharpness)
+        largest[k], smooth[k] = _exact_and_smooth_maximum(use, sharpness)
         for t in range(T):
             for j in range(n):
                 gradient[k, k, t, j] = use[t, j] * sign[t, j]
@@ -151,7 +151,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 
 @njit(cache=True)
-def _smooth_maximum(use, sharpness):
+def _exact_and_smooth_maximum(use, sharpness):
     """Return exact and smooth maximum of `use` (T, m); replace `use` by the gradient."""
     top = use.max()
     total = 0.0
@@ -178,7 +178,7 @@ def _write_torque_use(
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):
             use[t, j] = abs(tau[t, j]) / limits.max_torques[j]
-    largest[3], smooth[3] = _smooth_maximum(use, sharpness)
+    largest[3], smooth[3] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
@@ -218,7 +218,7 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
             size[t, k] = np.sqrt(a * a + b * b + c * c)
             use[t, k] = size[t, k] / limits.max_sensor_norms[k]
-    largest[4], smooth[4] = _smooth_maximum(use, sharpness)
+    largest[4], smooth[4] = _exact_and_smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
@@ -251,7 +251,7 @@ def _write_workspace_use(
                 x = motion[9 + i] + p[i] - limits.box_middle[i]
                 use[t, 3 * k + i] = abs(x) / limits.box_half[i]
                 sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
-    largest[5], smooth[5] = _smooth_maximum(use, sharpness)
+    largest[5], smooth[5] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
@@ -289,7 +289,7 @@ def _write_clearance_use(
             use[t, k] = (
                 1.0 - (distance - limits.min_pair_distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
             )
-    largest[6], smooth[6] = _smooth_maximum(use, sharpness)
+    largest[6], smooth[6] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
         if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import CLEARANCE_M, CollisionScene
+from drake_teleop.lab.excitation.collision import MIN_CLEARANCE_M, CollisionScene
 from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
@@ -225,7 +225,7 @@ def _make_robot(
         capsule_radius=radii,
         capsule_pairs=pairs,
         min_pair_distances=distances,
-        clearance=CLEARANCE_M,
+        clearance=MIN_CLEARANCE_M,
     )
     return Robot(
         name=name,

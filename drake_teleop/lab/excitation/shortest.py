@@ -227,7 +227,9 @@ class ShortestMotionProblem(DesignProblem):
         write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._tolerance_use(_TOLERANCE_SHARPNESS_RATIO * criterion_sharpness)
+        use, worst, g_V = self._largest_error_over_tolerance(
+            _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
+        )
         criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
@@ -261,14 +263,14 @@ class ShortestMotionProblem(DesignProblem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(self._variances(self._weighted_regressor_rows(*motion), period)[0])
+        return np.sqrt(self._estimate_variances(self._weighted_regressor_rows(*motion), period)[0])
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
-    def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
+    def _estimate_variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         # Variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k, u_k = G^-1 B v_k: G is the information of
         # weighted least squares; B contains the noise densities; e_k is a row of `errors`
         # (sandwich, White, Econometrica 1980).
@@ -282,9 +284,9 @@ class ShortestMotionProblem(DesignProblem):
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
+    def _largest_error_over_tolerance(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
-        variances, v, u = self._variances(rows, self._period)
+        variances, v, u = self._estimate_variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
         smooth = float(logs.max() + np.log(weights.sum()) / sharpness)

@@ -21,7 +21,7 @@ from pydrake.multibody.tree import BodyIndex, SpatialInertia
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.random_postures import (
-    NUM_POSTURES,
+    NUM_RANDOM_POSTURES,
     Postures,
     StartRegion,
     degrees_of_freedom,
@@ -65,8 +65,8 @@ _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about
 _MAX_ERROR_OVER_DISPLACEMENT = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
-_MIN_START_JOINT_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
-MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
+_MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
+MIN_HELD_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_JOINT_MOVE_TO_CORNER = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
@@ -130,7 +130,7 @@ class TrialWalls(Environment):
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add one floating body for each wall."""
         for edge in WALL_EDGES_M:
-            name = _wall_name(edge)
+            name = _trial_wall_name(edge)
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
@@ -140,7 +140,7 @@ class TrialWalls(Environment):
             )
 
 
-def _wall_name(edge: float) -> str:
+def _trial_wall_name(edge: float) -> str:
     return f"wall of {edge:g} m"
 
 
@@ -180,7 +180,7 @@ def find_start_place(
                 _with_reachable_cube(pointed, place, is_free, vertical)
                 for place in places[:_MAX_TESTED_CUBES]
             ]
-            best = max(cubes, key=_place_merit, default=None)
+            best = max(cubes, key=_merit_of_start_place, default=None)
     if best is None or best.cube_half_m == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
@@ -195,10 +195,10 @@ def find_start_place(
 def _find_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
-    for share in (1.0, MIN_LOAD_SHARE):
+    for share in (1.0, MIN_HELD_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
-        strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
+        strong = (np.abs(torques) < MAX_HOLDING_TORQUE_USE * arm.effort_limit).all(axis=1)
         if (roomy & strong).any():
             return np.flatnonzero(roomy & strong)
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
@@ -206,7 +206,7 @@ def _find_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
 
 def _describe_removed_postures(region: StartRegion, left: int) -> str:
     causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
-    return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
+    return f"of {NUM_RANDOM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
 def _order_postures_to_solve(
@@ -237,7 +237,7 @@ def _solve_candidates(
         solved = [
             start
             for q, position in zip(postures.q, postures.p_WS, strict=True)
-            for start in _exact_starts(arm, q, position)
+            for start in _starts_at_rounded_position(arm, q, position)
         ]
     if not solved:
         return
@@ -254,7 +254,9 @@ def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
     return pose
 
 
-def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Array, Array, bool]]:
+def _starts_at_rounded_position(
+    arm: ArmModel, q: Array, position: Array
+) -> Iterator[tuple[Array, Array, bool]]:
     """Yield joint positions near q, their pose, and whether `slave.position` specifies them."""
     position = np.round(position, 2)
     for yaw_deg in _TOOL_YAWS_DEG:
@@ -311,7 +313,7 @@ def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
         [x, y, z + (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0]
     )
     for edge in WALL_EDGES_M:
-        body = plant.GetBodyByName(_wall_name(edge))
+        body = plant.GetBodyByName(_trial_wall_name(edge))
         plant.SetFreeBodyPose(shapes.context, body, middle)
         walls[body.index()] = edge
     return walls
@@ -333,7 +335,7 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
 
-def _place_merit(place: StartPlace) -> tuple[float, float, bool, float]:
+def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]:
     enough_room, enough_space = (
         min(place.joint_margin, _SUFFICIENT_START_JOINT_MARGIN),
         min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_EDGE_M),

@@ -10,8 +10,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
-    MAX_TORQUE_USE,
-    MIN_LOAD_SHARE,
+    MAX_HOLDING_TORQUE_USE,
+    MIN_HELD_LOAD_SHARE,
     OPPOSITE_AXIS,
     TOOL_AXES,
     StartPlace,
@@ -110,7 +110,7 @@ def plan_station(
     plane = base_plane(shapes)
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
-    share = 1.0 if own_tool else MIN_LOAD_SHARE if tool is None else 0.0
+    share = 1.0 if own_tool else MIN_HELD_LOAD_SHARE if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_torque_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
@@ -226,7 +226,7 @@ def _without_weak_torque_limits(
         share: share of the load that the arm must hold.
     """
     torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
-    weak = torque > MAX_TORQUE_USE * arm.effort_limit
+    weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit
     names = tuple(np.array(arm.joint_names)[weak].tolist())
     texts = [
         f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
@@ -239,7 +239,7 @@ def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
-        if np.abs(torque / arm.effort_limit).max() < MAX_TORQUE_USE:
+        if np.abs(torque / arm.effort_limit).max() < MAX_HOLDING_TORQUE_USE:
             break
     return mass
 

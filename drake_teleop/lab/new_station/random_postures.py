@@ -18,7 +18,7 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
 from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 
-NUM_POSTURES = 20_000
+NUM_RANDOM_POSTURES = 20_000
 _MIN_COS_TOOL_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
 # Distance of S from the vertical line through the first joint, and its height above that joint, in
 # units of the reach.
@@ -72,7 +72,7 @@ class StartRegion:
         first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
         is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
-        side_rad: direction of the region about z_W, from x_W [rad].
+        side_direction_rad: direction of the region about z_W, from x_W [rad].
         removed_counts: number of postures that each condition removed.
     """
 
@@ -81,7 +81,7 @@ class StartRegion:
     first_joint_W: Array
     reach: float
     is_joint_above_plane: NDArray[np.bool_]
-    side_rad: float = 0.0
+    side_direction_rad: float = 0.0
     removed_counts: tuple[tuple[str, int], ...] = ()
 
     @property
@@ -92,7 +92,7 @@ class StartRegion:
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
             float(self.first_joint_W[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
         )
-        direction = np.array([np.cos(self.side_rad), np.sin(self.side_rad)])
+        direction = np.array([np.cos(self.side_direction_rad), np.sin(self.side_direction_rad)])
         return np.array([*(self.first_joint_W[:2] + r * direction), height])
 
 
@@ -115,10 +115,10 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
 
 
 def random_postures(arm: ArmModel) -> Postures:
-    """Return `NUM_POSTURES` random postures."""
+    """Return `NUM_RANDOM_POSTURES` random postures."""
     lower, upper = joint_sampling_range(arm)
     random = np.random.default_rng(0)
-    return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
+    return postures_at(arm, random.uniform(lower, upper, (NUM_RANDOM_POSTURES, arm.num_joints)))
 
 
 def select_suitable_postures(
@@ -185,7 +185,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
     # Only as many singular values as the arm has degrees of freedom.
-    smallest = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    smallest = _jacobian_singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
     elbow = (
         np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
@@ -207,7 +207,7 @@ def joint_margins(arm: ArmModel, q: Array) -> Array:
     return margins
 
 
-def _singular_values(arm: ArmModel, postures: Postures) -> Array:
+def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
     # Rotations are multiplied by `orientation_length` [m].
     slides = (arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
@@ -220,7 +220,7 @@ def _singular_values(arm: ArmModel, postures: Postures) -> Array:
 def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
-    values = _singular_values(arm, few)
+    values = _jacobian_singular_values(arm, few)
     return int((values > _MAX_RATIO_OF_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
 
 

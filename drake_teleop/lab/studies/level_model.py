@@ -65,7 +65,7 @@ class Levels:
         index: (n,) level of each point.
         names: labels of the levels with a point.
         within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
-        centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
+        centred_columns: (n, k) regression columns with zero mean: numbers, or indicators of all values but
             one.
         middle_columns: (levels, k) these columns at the middle of each level.
     """
@@ -73,7 +73,7 @@ class Levels:
     index: NDArray[np.int64]
     names: list[str]
     within: Array | None
-    centred: Array
+    centred_columns: Array
     middle_columns: Array
 
 
@@ -225,7 +225,7 @@ def fit_level_model(
         levels = [
             levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
         ]
-        model = _build_model(levels, products, known, by_chance)
+        model = _build_level_model(levels, products, known, by_chance)
         if model is not None:
             found = model
             if model.X.shape[1] <= len(model.X) / 2:
@@ -233,7 +233,7 @@ def fit_level_model(
     return found
 
 
-def _build_model(
+def _build_level_model(
     factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
@@ -244,7 +244,9 @@ def _build_model(
     columns += [f.within[known, None] for f in factors if f.within is not None]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _pairwise_column_products(factors[i].centred[known], factors[j].centred[known])
+        pair = _pairwise_column_products(
+            factors[i].centred_columns[known], factors[j].centred_columns[known]
+        )
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)

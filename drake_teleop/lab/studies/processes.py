@@ -61,7 +61,8 @@ def open_executor(
         from joblib import effective_n_jobs
 
         yield RunExecutor(
-            effective_n_jobs(jobs), lambda run, chunks: _run_locally(run, chunks, store, jobs)
+            effective_n_jobs(jobs),
+            lambda run, chunks: _run_in_local_processes(run, chunks, store, jobs),
         )
         return
     with _open_dask_client(cluster, jobs) as client:
@@ -70,7 +71,9 @@ def open_executor(
         yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+def _run_in_local_processes(
+    run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int
+) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2

@@ -76,7 +76,7 @@ def run_study(
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
     identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
-    schema = _table_schema(study, first_rows[0])
+    schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = (
         _group_into_chunks(first_rows)
@@ -103,7 +103,9 @@ def run_study(
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
-                    new = study.next_points(points, _objective_of_points(study, store, len(points)))
+                    new = study.next_points(
+                        points, _mean_objective_of_points(study, store, len(points))
+                    )
                     chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
@@ -123,7 +125,7 @@ def _group_into_chunks(rows: Chunk) -> list[Chunk]:
     return chunks
 
 
-def _objective_of_points(study: Study, store: Store, points: int) -> Array:
+def _mean_objective_of_points(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -192,7 +194,7 @@ def _run_chunk(
     return found
 
 
-def _table_schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:
+def _schema_of_run_table(study: Study, row: dict[str, Any]) -> dict[str, Any]:
     import polars as pl
 
     vector = pl.List(pl.Float64)

@@ -93,7 +93,8 @@ def scaling_study_command(
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
-            selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
+            selection: _find_best_scales(found, sigmas, gammas)
+            for selection, found in answers.items()
         },
         "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
@@ -165,7 +166,7 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _best_scales(
+def _find_best_scales(
     found: ScaleRating, sigmas: list[float], gammas: list[float]
 ) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
@@ -277,7 +278,7 @@ def draw_best_scales(
             axes.set_title(f"counts: {selection}")
             for i, j in np.ndindex(found.merit.shape):
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
-                axes.text(j, i, _cell_text(found, i, j), color="white" if dark else "black",
+                axes.text(j, i, _merit_cell_text(found, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
         bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
@@ -288,7 +289,7 @@ def draw_best_scales(
     return figure
 
 
-def _cell_text(found: ScaleRating, i: int, j: int) -> str:
+def _merit_cell_text(found: ScaleRating, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
         return f"{found.failure_share[i, j]:.0%} fail"
     best = f"\nbest: {found.best_share[i, j]:.0%}" if found.best_share[i, j] >= 0.005 else ""

@@ -39,7 +39,7 @@ from drake_teleop.station.station import MakeTeleopStation
 MAX_REST_FORCE_N = 0.05
 """Largest rendered force above `REST_BAND_HZ` of a station at rest, free or pressing, rms [N]."""
 REST_BAND_HZ = 5.0
-MIN_RENDERED_SHARE = 0.9
+MIN_RENDERED_FORCE_SHARE = 0.9
 """Smallest accepted rendered force, as a share of the scaled contact force."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
@@ -159,19 +159,19 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `gamma_caps`: low-pass [Hz] -> upper bound of gamma.
+    `gamma_upper_bounds`: low-pass [Hz] -> upper bound of gamma.
     """
 
     base: Scenario
     stated: StatedSet
-    gamma_caps: dict[float, float]
+    gamma_upper_bounds: dict[float, float]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = self.gamma_caps[settings.low_pass_hz] * self.stated.requirements.margin
+        cap = self.gamma_upper_bounds[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -182,7 +182,7 @@ class GammaSearch:
                 self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
             ]
             shares[gamma] = min(found)
-            return 1.0 if shares[gamma] >= MIN_RENDERED_SHARE else -1.0
+            return 1.0 if shares[gamma] >= MIN_RENDERED_FORCE_SHARE else -1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
@@ -192,7 +192,7 @@ class GammaSearch:
                 if stability_sign(low) > 0
                 else -np.inf
             )
-        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_SHARE]
+        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_FORCE_SHARE]
         gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}

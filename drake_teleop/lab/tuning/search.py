@@ -20,7 +20,7 @@ from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
     GIVEN_SETTINGS_NAME,
     MAX_REST_FORCE_N,
-    MIN_RENDERED_SHARE,
+    MIN_RENDERED_FORCE_SHARE,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
@@ -30,10 +30,10 @@ from drake_teleop.lab.tuning.press_trial import (
 )
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_SHARE`."""
+"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_FORCE_SHARE`."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
-WALL_FACTORS = (1.2, 2.0)
+STIFFEST_WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
@@ -113,7 +113,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
+    walls = [stiffest, *(factor * stiffest for factor in STIFFEST_WALL_FACTORS)]
     limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
     return SearchResult(chosen, search, given, inside, limits)
 
@@ -159,7 +159,7 @@ def _find_gamma_limit_in_station(
 def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_SHARE)
+    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_FORCE_SHARE)
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:

@@ -88,7 +88,7 @@ def tune(
         environment=given.environment,
         contact_detection=given.contact_detection,
     )
-    summary = _make_summary(found, tuned, stated, network)
+    summary = _make_tuning_summary(found, tuned, stated, network)
     with output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
@@ -110,7 +110,7 @@ def tune(
     return summary
 
 
-def _make_summary(
+def _make_tuning_summary(
     found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limit_runs if row["wall"] <= stated.walls[1]]
@@ -141,13 +141,13 @@ def _make_summary(
         "settings": settings,
         "stated": about,
         "figures": figures,
-        "sentences": _result_sentences(found.settings, figures, about, scale),
+        "sentences": _tuning_result_sentences(found.settings, figures, about, scale),
         "search": found.searched_settings,
         "trials": [*found.given_runs, *found.corner_runs, *found.limit_runs],
     }
 
 
-def _result_sentences(
+def _tuning_result_sentences(
     chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
 ) -> list[str]:
     low, high = (1e-3 * wall for wall in about["walls"])
