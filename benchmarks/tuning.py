@@ -92,7 +92,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     for k in range(draws):
         grip, wall = str(rng.choice(HANDS)), float(np.exp(rng.uniform(low, high)))
         inside.append(rests(grip, wall, settings.gamma, k))
-        beyond = stated.requirements.margin * float(rng.uniform(1.0, 1.2))
+        beyond = stated.requirements.loop_gain_margin * float(rng.uniform(1.0, 1.2))
         outside.append(not rests(grip, stated.walls[1], settings.gamma * beyond, k))
     row |= {"inside": float(np.mean(inside)), "outside_fails": float(np.mean(outside))}
     trial = StationTrial(base, base, stated, identified_load(base, False).estimate)

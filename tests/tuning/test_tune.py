@@ -127,7 +127,9 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
     assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(trial().stated.corners)
+    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(
+        trial().stated_set.corners
+    )
     assert not all(meets_requirements(row) for row in found.limit_runs)
 
 

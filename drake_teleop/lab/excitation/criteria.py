@@ -37,14 +37,14 @@ class CriterionScales(NamedTuple):
     """Noise, length and load that scale the criteria.
 
     Attributes:
-        noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
+        wrench_noise: standard deviations (sigma_f [N], sigma_tau [N m]), white at 1 kHz.
         length: characteristic length L [m] of kappa_w10.
-        phi: (10,) nominal load about the origin of S, for A16 and D16.
+        nominal_phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
-    noise: tuple[float, float]
+    wrench_noise: tuple[float, float]
     length: float
-    phi: Array
+    nominal_phi: Array
 
 
 def characteristic_length(phi: Array) -> float:
@@ -66,13 +66,13 @@ class Criterion:
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")
-        sigma = scales.noise if whitened else (1.0, 1.0)
+        sigma = scales.wrench_noise if whitened else (1.0, 1.0)
         self._rows = np.repeat(1 / np.array(sigma), 3)
         columns = np.ones(16 if self.with_offsets else 10)
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable_errors(scales.phi)
+            columns = _acceptable_errors(scales.nominal_phi)
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:

@@ -60,13 +60,13 @@ class Evaluation:
 
     Attributes:
         log_criterion: smooth logarithm of the criterion.
-        uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
+        smooth_limit_uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
         gradients: (8, unknowns) gradients of criterion (first) and uses.
         largest_limit_use: exact largest use of any limit.
     """
 
     log_criterion: float
-    uses: Array
+    smooth_limit_uses: Array
     gradients: Array
     largest_limit_use: float
 
@@ -243,7 +243,7 @@ class _DescentSearch:
             for x in batch:
                 self._count_evaluation()
                 point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
-                merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+                merit.append(point.log_criterion + 10 * max(point.smooth_limit_uses.max() - 1, 0))
             for k in np.argsort(merit)[:_NUM_DESCENT_STARTS]:
                 yield batch[k]
 
@@ -279,7 +279,7 @@ class _DescentSearch:
             constraints={
                 "type": "ineq",
                 "fun": lambda x, *sharpness: (
-                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).uses
+                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).smooth_limit_uses
                 ),
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (criterion_sharpness, limit_sharpness),
@@ -292,7 +292,7 @@ class _DescentSearch:
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
-        excess = np.maximum(point.uses - USABLE_LIMIT_SHARE, 0)
+        excess = np.maximum(point.smooth_limit_uses - USABLE_LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 

@@ -59,7 +59,7 @@ class Robot:
     Attributes:
         plant: Drake's plant, with the heaviest load.
         sensor_frame: frame S of the wrist sensor.
-        home: (n,) start posture of the search [rad].
+        home_posture: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
     """
 
@@ -70,9 +70,9 @@ class Robot:
     sensor_frame: Frame
     arm: ArmModel
     limits: Limits
-    scales: CriterionScales
-    noise: SensorNoise
-    home: Array
+    criterion_scales: CriterionScales
+    sensor_noise: SensorNoise
+    home_posture: Array
     assumptions: tuple[str, ...]
     temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
@@ -235,9 +235,11 @@ def _make_robot(
         sensor_frame=scene.sensor_frame,
         arm=arm,
         limits=limits,
-        scales=CriterionScales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
-        noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
-        home=middle if start is None else start,
+        criterion_scales=CriterionScales(
+            (float(std[0]), float(std[3])), characteristic_length(phi), phi
+        ),
+        sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
+        home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),
         temporary_folders=tuple(folders),
     )

@@ -105,7 +105,12 @@ def design_shortest_motion(
     )
     factor = np.ones(len(errors))
     task = DesignTask(
-        robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
+        robot.arm.table,
+        robot.limits,
+        Criterion("A16", robot.criterion_scales),
+        robot.home_posture,
+        1.0,
+        harmonics,
     )
     worst, around = np.inf, None
     best: ShortestMotion | None = None
@@ -125,7 +130,7 @@ def design_shortest_motion(
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(
-            *motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.heaviest_phi
+            *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
         )
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
@@ -182,8 +187,8 @@ class ShortestMotionProblem(DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = relative_white_noise_densities(robot.noise, robot.limits.heaviest_phi)
-        self._roots = np.sqrt(robot.noise.white_noise_densities[:6])
+        self._noise = relative_white_noise_densities(robot.sensor_noise, robot.limits.heaviest_phi)
+        self._roots = np.sqrt(robot.sensor_noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ

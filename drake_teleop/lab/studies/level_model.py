@@ -65,8 +65,8 @@ class Levels:
         index: (n,) level of each point.
         names: labels of the levels with a point.
         within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
-        centred_columns: (n, k) regression columns with zero mean: numbers, or indicators of all values but
-            one.
+        centred_columns: (n, k) regression columns with zero mean: numbers, or indicators of all
+            values but one.
         middle_columns: (levels, k) these columns at the middle of each level.
     """
 

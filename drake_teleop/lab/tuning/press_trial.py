@@ -98,22 +98,22 @@ class StationTrial:
 
     Args:
         user_scenario: scenario of the user, with its own passivity and scales.
-        base: the same without environment, task and passivity method.
-        estimate: (16,) load estimate.
+        base_scenario: the same without environment, task and passivity method.
+        load_estimate: (16,) load estimate.
     """
 
     user_scenario: Scenario
-    base: Scenario
-    stated: StatedSet
-    estimate: Array
+    base_scenario: Scenario
+    stated_set: StatedSet
+    load_estimate: Array
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
         if values["method"] != GIVEN_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base, self.stated)
+            scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base.channel
+        channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
@@ -121,10 +121,10 @@ class StationTrial:
             scenario.passivity,
             wall,
             task=task,
-            depth=press_depth(self.base, grip),
+            depth=press_depth(self.base_scenario, grip),
         )
         setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
-        station = MakeTeleopStation(setup, load_estimate=self.estimate)
+        station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
@@ -143,7 +143,7 @@ class StationTrial:
             *(rms_above_hz(force, period, REST_BAND_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
-        human = self.base.operator.perception
+        human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
             "rests": float(found.stable),
@@ -162,16 +162,19 @@ class GammaSearch:
     `gamma_upper_bounds`: low-pass [Hz] -> upper bound of gamma.
     """
 
-    base: Scenario
-    stated: StatedSet
+    base_scenario: Scenario
+    stated_set: StatedSet
     gamma_upper_bounds: dict[float, float]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
-        axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
+        axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = self.gamma_upper_bounds[settings.low_pass_hz] * self.stated.requirements.margin
+        cap = (
+            self.gamma_upper_bounds[settings.low_pass_hz]
+            * self.stated_set.requirements.loop_gain_margin
+        )
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -179,7 +182,8 @@ class GammaSearch:
         def stability_sign(log_gamma: float) -> float:
             gamma = float(np.exp(log_gamma))
             found = [
-                self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
+                self.share_in_one_axis(axis, settings, gamma, *c, seed)
+                for c in self.stated_set.corners
             ]
             shares[gamma] = min(found)
             return 1.0 if shares[gamma] >= MIN_RENDERED_FORCE_SHARE else -1.0
@@ -198,11 +202,11 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
-        sampling = sampling_of_scenario(self.base)
+        sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
-        for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
+        for grip, wall in [*self.stated_set.corners, (self.stated_set.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
@@ -218,7 +222,7 @@ class GammaSearch:
         seed: int,
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
-        forward, backward = self.base.channel.networks_of_directions()
+        forward, backward = self.base_scenario.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
         shown = {
             entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
@@ -227,11 +231,15 @@ class GammaSearch:
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        added = (
+            0.0
+            if self.base_scenario.wrist_sensor.ideal
+            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        )
         task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
-            settings.passivity(self.stated),
+            settings.passivity(self.stated_set),
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,

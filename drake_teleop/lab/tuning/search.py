@@ -64,7 +64,7 @@ class SearchResult:
 
 def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest force."""
-    base, stated = trial.base, trial.stated
+    base, stated = trial.base_scenario, trial.stated_set
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
@@ -121,7 +121,10 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
 def _find_gamma_limit_in_station(
     settings: Settings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    margin, ends = (trial.stated.requirements.margin, [c[0] for c in trial.stated.corners])
+    margin, ends = (
+        trial.stated_set.requirements.loop_gain_margin,
+        [c[0] for c in trial.stated_set.corners],
+    )
     hands = list(dict.fromkeys(ends))
     tries = 0
 
@@ -130,7 +133,7 @@ def _find_gamma_limit_in_station(
         tried = dataclasses.replace(settings, gamma=margin * gamma)
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
-        for wall in dict.fromkeys(trial.stated.walls[::-1]):
+        for wall in dict.fromkeys(trial.stated_set.walls[::-1]):
             name = f"station_{settings.method}_{tries}_{wall:.0f}"
             rows += execute(name, _study_of_settings(tried, hands, [wall]), trial)
             if not all(meets_requirements(row, margin) for row in rows):
@@ -181,8 +184,11 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
 
 
 def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
-    gamma = row["gamma_limit"] / trial.stated.requirements.margin
-    human, scale = (trial.base.operator.perception, trial.base.force_scaling.force_scale)
+    gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
+    human, scale = (
+        trial.base_scenario.operator.perception,
+        trial.base_scenario.force_scaling.force_scale,
+    )
     masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
@@ -193,7 +199,7 @@ def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, 
 
 def _rms_load_force_in_swing(trial: StationTrial) -> float:
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
-    return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+    return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
 def _study_of_settings(settings: Settings, hands: list[str], walls: list[float]) -> Study:

@@ -124,7 +124,7 @@ def _make_tuning_summary(
         if all(map(meets_requirements, found.given_runs))
         else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
-        "margin": stated.requirements.margin,
+        "margin": stated.requirements.loop_gain_margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
         if failed
         else None,
