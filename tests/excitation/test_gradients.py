@@ -28,7 +28,7 @@ from drake_teleop.lab.excitation.limits import (
 from drake_teleop.lab.excitation.optimizer import DesignProblem, DesignTask, _DescentSearch
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
-    _motion_error_filter,
+    _motion_error_polynomials,
     predicted_deviations,
 )
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -112,7 +112,7 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
     for gains in fusion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _motion_error_filter(gains, T)
+        numerator, denominator = _motion_error_polynomials(gains, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)

@@ -13,8 +13,8 @@ from drake_teleop.lab.comparison.delayed_contact import leaf_thickness
 from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
-    Settings,
     StationTrial,
+    TunedSettings,
     press_depth,
     rms_above_hz,
 )
@@ -141,7 +141,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
     stated = make_stated_set(["light", "firm"], [1.0], "press")
-    tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
+    tuned = TunedSettings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0
     assert tuned.wrist_sensor.bandwidth_hz == 100.0

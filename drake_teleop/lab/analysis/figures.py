@@ -145,13 +145,13 @@ def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
-        grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        grip: _find_stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
         for grip in GRIP_IMPEDANCES
     }
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
 
-def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
+def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
     stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)

@@ -97,8 +97,8 @@ class Linearization:
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
         rows, columns = (
-            self._find_indices(outputs, self.outputs),
-            self._find_indices(inputs, self.inputs),
+            self._find_component_indices(outputs, self.outputs),
+            self._find_component_indices(inputs, self.inputs),
         )
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
@@ -183,7 +183,9 @@ class Linearization:
         )
 
     @staticmethod
-    def _find_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+    def _find_component_indices(
+        names: str | Sequence[str], known: tuple[str, ...]
+    ) -> tuple[int, ...]:
         parts = _port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
@@ -382,7 +384,7 @@ class _PeriodSimulator:
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         self._simulator.Initialize()
 
     def _get_block(self, name: str) -> Any:
@@ -395,7 +397,7 @@ class _PeriodSimulator:
     def _evaluate_output(self, system: str, port: str) -> Array:
         return np.array(self._get_block(system).GetOutputPort(port).Eval(self._get_context(system)))
 
-    def _fix_input(self, system: str, port: str, value: object) -> None:
+    def _fix_input_port(self, system: str, port: str, value: object) -> None:
         self._get_block(system).GetInputPort(port).FixValue(self._get_context(system), value)
 
     def _make_state_groups(self) -> list[_StateGroup]:
@@ -446,14 +448,16 @@ class _PeriodSimulator:
                 state.get_mutable_value()[group.indices] = values
         self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
-    def _apply_inputs(self, u: Array) -> None:
-        self._fix_input("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix_input("inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12]))
-        self._fix_input("force_display", "wrench_command", self._wrench + u[12:18])
+    def _apply_component_inputs(self, u: Array) -> None:
+        self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
+        self._fix_input_port(
+            "inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12])
+        )
+        self._fix_input_port("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
-        self._fix_input("slave_plant", "applied_spatial_force", [self._push])
-        self._fix_input("wrist_sensor", "applied_wrench_W", push)
+        self._fix_input_port("slave_plant", "applied_spatial_force", [self._push])
+        self._fix_input_port("wrist_sensor", "applied_wrench_W", push)
 
     def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
@@ -503,18 +507,18 @@ class _PeriodSimulator:
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
-            self._apply_inputs(np.zeros(24))
+            self._apply_component_inputs(np.zeros(24))
             self._run_one_period()
-        return self._find_equilibrium(self._balance_hand_force())
+        return self._find_equilibrium_state(self._balance_hand_force())
 
     def _balance_hand_force(self) -> Array:
         self._wrench = self._evaluate_output("force_scaling", "wrench_B")
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         self._hand = -self._evaluate_output("force_display", "force_to_master")
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         return self.get_state()
 
-    def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
+    def _find_equilibrium_state(self, x: Array) -> tuple[Array, Array, Array]:
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_EQUILIBRIUM_NEWTON_STEPS):
             A, C = self.differentiate_by_state(x)
@@ -535,7 +539,7 @@ class _PeriodSimulator:
 
     def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         for k, step in enumerate(self._steps):
             ends, outputs = [], []
             for sign in (1.0, -1.0):
@@ -557,7 +561,7 @@ class _PeriodSimulator:
             ends = []
             for sign in (1.0, -1.0):
                 self._set_state(x)
-                self._apply_inputs(sign * step * np.eye(24)[k])
+                self._apply_component_inputs(sign * step * np.eye(24)[k])
                 ends.append(self._run_one_period())
             B[:, k] = (ends[0] - ends[1]) / (2 * step)
         return B

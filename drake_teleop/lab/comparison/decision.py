@@ -45,7 +45,7 @@ class MethodResult:
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
     """Return the result of each (method, network) in a summary."""
     return {
-        (row["method"], row["network"]): _summarise_runs(
+        (row["method"], row["network"]): _summarise_runs_of_method(
             [
                 run
                 for run in summary["station"]
@@ -57,7 +57,9 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
     }
 
 
-def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
+def _summarise_runs_of_method(
+    runs: Sequence[Mapping[str, Any]], leaked_by_hands: float
+) -> MethodResult:
     if not all(run["stable"] for run in runs):
         return MethodResult(
             VERDICT_UNSTABLE, motion_texts=tuple(map(_describe_motion_in_hold, runs))

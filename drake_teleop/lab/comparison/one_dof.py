@@ -276,9 +276,11 @@ def figures_of_traces(
 
     hold = window_slice(task.release_start - task.rest_window, task.release_start)
     rest = window_slice(task.end - task.rest_window, task.end)
-    hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in (hold, rest))
+    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max((_detrended_range(x[part]) for x in angles for part in (hold, rest)), default=0.0)
+    turning = max(
+        (_range_about_parabola(x[part]) for x in angles for part in (hold, rest)), default=0.0
+    )
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -318,7 +320,7 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float6
     return np.asarray(felt.real)
 
 
-def _detrended_range(x: NDArray[np.float64]) -> float:
+def _range_about_parabola(x: NDArray[np.float64]) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

@@ -56,7 +56,7 @@ GIVEN_SETTINGS_NAME = "as given"
 
 
 @dataclass(frozen=True)
-class Settings:
+class TunedSettings:
     """Settings that `tune` chooses."""
 
     method: str
@@ -87,9 +87,9 @@ class Settings:
         )
 
 
-def settings_from_values(values: FactorValues) -> Settings:
-    names = [entry.name for entry in dataclasses.fields(Settings)]
-    return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
+def settings_from_values(values: FactorValues) -> TunedSettings:
+    names = [entry.name for entry in dataclasses.fields(TunedSettings)]
+    return TunedSettings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class GammaSearch:
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
-    def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
+    def _linear_gamma_limit(self, axis: Any, settings: TunedSettings) -> float:
         sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -215,7 +215,7 @@ class GammaSearch:
     def share_in_one_axis(
         self,
         axis: AxisParameters,
-        settings: Settings,
+        settings: TunedSettings,
         gamma: float,
         grip: str,
         wall: float,

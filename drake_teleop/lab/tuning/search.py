@@ -24,8 +24,8 @@ from drake_teleop.lab.tuning.press_trial import (
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
-    Settings,
     StationTrial,
+    TunedSettings,
     settings_from_values,
 )
 
@@ -55,7 +55,7 @@ class SearchResult:
         limit_runs: runs of the chosen settings at the stiffest wall and at stiffer ones.
     """
 
-    settings: Settings
+    settings: TunedSettings
     searched_settings: list[Row]
     given_runs: list[Row]
     corner_runs: list[Row]
@@ -70,11 +70,13 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_settings(Settings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
+        _study_of_settings(TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
         trial,
     )
     quiet = execute(
-        "noise", _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]), trial
+        "noise",
+        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]),
+        trial,
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -97,7 +99,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
             candidates.setdefault(row["method"], row)
-    found: list[tuple[float, Settings, list[Row]]] = []
+    found: list[tuple[float, TunedSettings, list[Row]]] = []
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
@@ -119,7 +121,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
 
 
 def _find_gamma_limit_in_station(
-    settings: Settings, trial: StationTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     margin, ends = (
         trial.stated_set.requirements.loop_gain_margin,
@@ -202,7 +204,7 @@ def _rms_load_force_in_swing(trial: StationTrial) -> float:
     return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of_settings(settings: Settings, hands: list[str], walls: list[float]) -> Study:
+def _study_of_settings(settings: TunedSettings, hands: list[str], walls: list[float]) -> Study:
     factors = [
         Factor(field="method", words=[settings.method]),
         Factor(field="gamma", values=[settings.gamma]),

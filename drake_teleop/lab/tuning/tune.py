@@ -21,7 +21,7 @@ from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
+from drake_teleop.lab.tuning.press_trial import StationTrial, TunedSettings
 from drake_teleop.lab.tuning.search import (
     SearchResult,
     make_study_executor,
@@ -148,7 +148,7 @@ def _make_tuning_summary(
 
 
 def _tuning_result_sentences(
-    chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
+    chosen: TunedSettings, figures: dict[str, Any], about: dict[str, Any], scale: float
 ) -> list[str]:
     low, high = (1e-3 * wall for wall in about["walls"])
     hands = " to ".join(dict.fromkeys((about["hands"][0], about["hands"][-1])))
