@@ -63,7 +63,12 @@ GAIN, CROSS_TALK, DELAY, DRAWS = 0.01, 0.003, 1e-3, 16
 
 def task_of(robot: Robot, criterion: str, period: float) -> DesignTask:
     return DesignTask(
-        robot.arm.table, robot.limits, Criterion(criterion, robot.scales), robot.home, period, 5
+        robot.arm.table,
+        robot.limits,
+        Criterion(criterion, robot.criterion_scales),
+        robot.home_posture,
+        period,
+        5,
     )
 
 
@@ -97,7 +102,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
     merits = []
     for x in candidates:
         point = problem.evaluate(x, 1.0, 100.0)
-        merits.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+        merits.append(point.log_criterion + 10 * max(point.smooth_limit_uses.max() - 1, 0))
     best, start = float("inf"), time.thread_time()
 
     def evaluate(x: np.ndarray) -> Any:
@@ -114,7 +119,10 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
             lambda x: evaluate(x).log_criterion,
             candidates[int(np.argmin(merits))],
             method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).uses},
+            constraints={
+                "type": "ineq",
+                "fun": lambda x: USABLE_LIMIT_SHARE - evaluate(x).smooth_limit_uses,
+            },
             options={"maxiter": 1000},
         )
     return best

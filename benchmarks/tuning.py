@@ -31,7 +31,7 @@ from stations import _slave
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.tuning.press_trial import GammaSearch, Settings, StationTrial
+from drake_teleop.lab.tuning.press_trial import GammaSearch, StationTrial, TunedSettings
 from drake_teleop.lab.tuning.search import meets_requirements
 from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
@@ -77,8 +77,8 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
             return row | {"error": str(error)}
     row |= {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu}
     row |= {"sentences": found["sentences"], **found["figures"]}
-    names = [entry.name for entry in dataclasses.fields(Settings)]
-    settings = Settings(**{name: found["settings"][name] for name in names})
+    names = [entry.name for entry in dataclasses.fields(TunedSettings)]
+    settings = TunedSettings(**{name: found["settings"][name] for name in names})
     base = without_task_and_method(scenario, network)
     search = GammaSearch(base, stated, {})
     axis = OneAxisFromScenario(base, (0.0, 0.0, 1.0))
@@ -92,7 +92,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     for k in range(draws):
         grip, wall = str(rng.choice(HANDS)), float(np.exp(rng.uniform(low, high)))
         inside.append(rests(grip, wall, settings.gamma, k))
-        beyond = stated.requirements.margin * float(rng.uniform(1.0, 1.2))
+        beyond = stated.requirements.loop_gain_margin * float(rng.uniform(1.0, 1.2))
         outside.append(not rests(grip, stated.walls[1], settings.gamma * beyond, k))
     row |= {"inside": float(np.mean(inside)), "outside_fails": float(np.mean(outside))}
     trial = StationTrial(base, base, stated, identified_load(base, False).estimate)

@@ -112,12 +112,12 @@ def test_edited_sources_or_models_change_the_cache_key(identifications, tmp_path
     for folder, name in ((package / "room", "a.py"), (models, "tool.sdf")):
         folder.mkdir(parents=True)
         (folder / name).write_text("x = 1")
-    hashes = [module._hash_sources(package, models)]
+    hashes = [module._hash_source_files(package, models)]
     for path in (package / "room/a.py", models / "tool.sdf"):
         path.write_text("x = 2")
-        hashes.append(module._hash_sources(package, models))
+        hashes.append(module._hash_source_files(package, models))
     (package / "room/a.py").rename(package / "room/b.py")
-    hashes.append(module._hash_sources(package, models))
+    hashes.append(module._hash_source_files(package, models))
     assert len(set(hashes)) == 4
     for each in hashes:
         monkeypatch.setattr(module, "_SOURCES_HASH", each)

@@ -112,7 +112,7 @@ def test_joint_margin_counts_more_than_cube_size():
         best._replace(cube_half_m=0.03, joint_margin=0.9),
         best._replace(cube_half_m=0.0, joint_margin=0.0),
     ]
-    assert max([*worse, best], key=place._place_merit) is best
+    assert max([*worse, best], key=place._merit_of_start_place) is best
 
 
 def turned(rpy, tmp_path):
@@ -170,7 +170,7 @@ def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, run
 
 
 def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(place, "_CUBE_HALVES_M", (*place._CUBE_HALVES_M, 2.0))
+    monkeypatch.setattr(place, "_CUBE_HALF_EDGES_M", (*place._CUBE_HALF_EDGES_M, 2.0))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     new_command(tmp_path / "mine", path, "sensor")

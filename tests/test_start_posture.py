@@ -9,7 +9,11 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_start_place
+from drake_teleop.lab.new_station.place import (
+    _find_holdable_postures,
+    _order_postures_to_solve,
+    find_start_place,
+)
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
@@ -238,15 +242,15 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
 def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].posture_shapes
     postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
-    usable, clear, clear_of_all = _rows_to_solve(shapes.arm, postures, region, shapes)
-    expected = _usable_rows(shapes.arm, postures.q)
+    usable, clear, clear_of_all = _order_postures_to_solve(shapes.arm, postures, region, shapes)
+    expected = _find_holdable_postures(shapes.arm, postures.q)
     np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
     assert 3 < len(clear) < len(usable) < len(postures.q)
     assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
     for row in usable[:: len(usable) // 500 + 1]:
         shapes.move_to(postures.q[row])
         assert (row in clear) != bool(overlap_warnings(shapes, of_arm=True))
-    (only,) = _rows_to_solve(shapes.arm, postures, region, None)
+    (only,) = _order_postures_to_solve(shapes.arm, postures, region, None)
     np.testing.assert_array_equal(only, usable)
 
 
@@ -330,7 +334,7 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = q[_usable_rows(weak, q)]
+    kept = q[_find_holdable_postures(weak, q)]
     roomy = joint_margins(weak, q) > 0.22
     assert 0 < roomy.sum() < len(q)
     if share > 1.0:

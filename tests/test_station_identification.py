@@ -44,7 +44,7 @@ def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monk
         found = FourierTrajectory(np.zeros(6), *np.full((2, 6, 3), len(designs)), 1 / period)
         return SimpleNamespace(trajectory=found)
 
-    monkeypatch.setattr(identification, "_DESIGN_CACHE", {})
+    monkeypatch.setattr(identification, "_TRAJECTORY_CACHE", {})
     monkeypatch.setattr(identification, "excite", excite)
     monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
     monkeypatch.setattr(identification, "criterion_values", lambda *_: {"kappa_w10": 4.0})

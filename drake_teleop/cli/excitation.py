@@ -127,7 +127,7 @@ def excite_command(
             )
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarize_excitation(found) | reached | {"seed": seed}
-    session = {"design_s": found.seconds}
+    session = {"design_s": found.design_cpu_time_s}
     with output_folder(out):
         write_table(out / "trajectory.csv", trajectory_table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
@@ -157,19 +157,23 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
         "criterion": found.criterion,
         **found.values,
         "meaning": {
-            name: CRITERION_TEXTS[name].format(L=robot.scales.length) for name in found.values
+            name: CRITERION_TEXTS[name].format(L=robot.criterion_scales.length)
+            for name in found.values
         },
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
             use.limit_name: {"share": use.used_share, "where": use.where, "t": use.time_s}
-            for use in found.uses
+            for use in found.limit_uses
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
             for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
-        "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
+        "noise": {
+            "force [N]": robot.criterion_scales.wrench_noise[0],
+            "torque [N m]": robot.criterion_scales.wrench_noise[1],
+        },
         "heaviest_load_kg": float(robot.limits.heaviest_phi[0]),
         "assumed": list(robot.assumptions),
     }
@@ -193,7 +197,7 @@ def draw_trajectory(found: Excitation) -> Figure:
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
         _draw_joints(joints, found)
         _draw_wrench(forces, torques, found)
-        progress.step(*found.history.T, where="post", color=BLUE)
+        progress.step(*found.criterion_history.T, where="post", color=BLUE)
         least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
         progress.set(
             title=f"{found.criterion} down to {least:.4g}",

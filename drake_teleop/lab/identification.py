@@ -43,7 +43,7 @@ from drake_teleop.station.station import MakeIdentificationStation
 # The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0
 #: Designed trajectory and its criterion kappa_w10, by a hash of all inputs of the design.
-_DESIGN_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
+_TRAJECTORY_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,11 +194,11 @@ def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTr
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
-    if key not in _DESIGN_CACHE or scenario.environment:  # the environment's files may change
+    if key not in _TRAJECTORY_CACHE or scenario.environment:  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
-        _DESIGN_CACHE[key] = found, criterion_values(robot, found)["kappa_w10"]
-    return copy.deepcopy(_DESIGN_CACHE[key])
+        _TRAJECTORY_CACHE[key] = found, criterion_values(robot, found)["kappa_w10"]
+    return copy.deepcopy(_TRAJECTORY_CACHE[key])
 
 
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:

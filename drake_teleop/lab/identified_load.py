@@ -29,7 +29,7 @@ CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 MAX_CACHED_FILES = 2000
 """Maximum number of cached files; each has 5 kB."""
 
-_HASHED_LIBRARIES = ("drake", "numpy", "scipy", "numba")
+_LIBRARIES_IN_CACHE_KEY = ("drake", "numpy", "scipy", "numba")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,7 +83,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))
 
 
-def _hash_sources(package: Path, models: Path) -> str:
+def _hash_source_files(package: Path, models: Path) -> str:
     files = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
     files |= {path.relative_to(models).as_posix(): path for path in models.rglob("*.*")}
     contents = (f"{name} {sha256(files[name].read_bytes()).hexdigest()}" for name in sorted(files))
@@ -91,13 +91,13 @@ def _hash_sources(package: Path, models: Path) -> str:
 
 
 # Hashed at import: the sources may be edited while this process runs the old ones.
-_SOURCES_HASH = _hash_sources(Path(__file__).parents[1], models_dir())
+_SOURCES_HASH = _hash_source_files(Path(__file__).parents[1], models_dir())
 
 
 def _cache_key(before: Scenario, detects: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
-    computed_by = [f"{name} {version(name)}" for name in _HASHED_LIBRARIES]
+    computed_by = [f"{name} {version(name)}" for name in _LIBRARIES_IN_CACHE_KEY]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
     models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.model_files()]
     what = (__version__, dataclasses.asdict(before), detects, computed_by, models)

@@ -25,8 +25,8 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_ESTIMATED_IN_RUN = "estimated during the run"
-_RESULT_FILES = (
+_LOAD_FOUND_IN_RUN = "estimated during the run"
+_RESULT_FILE_NAMES = (
     "sensor_log.parquet",
     "identification.json",
     "overview.png",
@@ -112,7 +112,7 @@ def _run_into_folder(
     log, scenario_file = out / "log.parquet", out / "scenario.yaml"
     # After an interruption, old files must not look like results of this run.
     remove_log(log)
-    for name in _RESULT_FILES:
+    for name in _RESULT_FILE_NAMES:
         with wrap_write_errors(out / name):
             (out / name).unlink(missing_ok=True)
     had_scenario = scenario_file.exists()
@@ -127,9 +127,9 @@ def _run_into_folder(
         if not log.exists() and not had_scenario:
             scenario_file.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(_describe_log(log)) from error
+            raise KeyboardInterrupt(_describe_unfinished_log(log)) from error
         if isinstance(error, CannotWrite):
-            raise DrakeTeleopError(str(error), remedy=_describe_log(log)) from error
+            raise DrakeTeleopError(str(error), remedy=_describe_unfinished_log(log)) from error
         raise
 
 
@@ -157,9 +157,9 @@ def run_scenario(
     if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
-            scenario, found.result, found.identification, _ESTIMATED_IN_RUN, found.real_time_factor
+            scenario, found.result, found.identification, _LOAD_FOUND_IN_RUN, found.real_time_factor
         )
-    identification, estimate, floor, source = None, None, None, _ESTIMATED_IN_RUN
+    identification, estimate, floor, source = None, None, None, _LOAD_FOUND_IN_RUN
     with show_progress(progress) as stage:
         if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
@@ -180,7 +180,7 @@ def _repeat_drive(drive: RecordedDrive, progress: StartStage, log: Path) -> Scen
     return ScenarioRun(drive.scenario, result, identification, "from the recorded drive", factor)
 
 
-def _describe_log(log: Path) -> str:
+def _describe_unfinished_log(log: Path) -> str:
     if not log.exists():
         return ""
     return f"{log} contains the {len(SimulationResult.scan_parquet(log).t)} samples until then"

@@ -72,9 +72,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
-        **_peak_values("peak_measured", "", measured),
-        **_peak_values("peak_contact", "", calculated),
-        **_peak_values("residual", "_max", calculated[free]),
+        **_named_peak_norms("peak_measured", "", measured),
+        **_named_peak_norms("peak_contact", "", calculated),
+        **_named_peak_norms("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
         "joint_speed_use": _largest_limit_use(result["slave_state"][:, n:], arm.velocity_limit),
         "joint_torque_use": _largest_limit_use(result["joint_torque"], arm.effort_limit),
@@ -82,12 +82,12 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
     if "force_to_master" in result:
-        summary |= _peak_values("peak", "_to_master", result["force_to_master"])
+        summary |= _named_peak_norms("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_delays(result, contact_spans(result.t, contact))
     if beyond := _describe_unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
-    summary |= _body_displacements(result)
+    summary |= _moving_body_displacements(result)
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
@@ -134,7 +134,7 @@ def _describe_unmodelled_contact(scenario: Scenario) -> str:
     return AddSlavePlant(builder, scenario.slave, surroundings).contact.drake_contact_reason
 
 
-def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
+def _moving_body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
     displacements, rotations = {}, {}
     for signal in (name for name in result.signals if name.startswith(MOVING_BODY_POSE_PREFIX)):
         name, first, last = signal.removeprefix(MOVING_BODY_POSE_PREFIX), *result[signal][[0, -1]]
@@ -146,7 +146,7 @@ def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]
     return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 
-def _peak_values(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
+def _named_peak_norms(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
     names = (f"{prefix}_force{suffix}_N", f"{prefix}_torque{suffix}_Nm")
     if not len(wrench):
         return dict.fromkeys(names)

@@ -33,7 +33,7 @@ from drake_teleop.lab.analysis.period_map import (
     SLAVE_V,
     SLAVE_X,
     Sampling,
-    _spring_response,
+    _mass_spring_motion,
     delay_in_hand_periods,
     period_map_of_cut_loop,
     sampled_two_port,
@@ -361,7 +361,7 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(
-        _spring_response(w**2, 0.0, np.array([t])),
+        _mass_spring_motion(w**2, 0.0, np.array([t])),
         ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
         strict=True,
     ):

@@ -122,7 +122,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     bases = []
     monkeypatch.setattr(study, "identified_load", lambda base, stage: SimpleNamespace(estimate=0))
     monkeypatch.setattr(
-        study, "_run_parallel", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
+        study, "_run_in_processes", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
     )
     study._run_station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]

@@ -11,10 +11,10 @@ from pydrake.geometry import Box, Cylinder, GeometryId
 from pydrake.geometry import Capsule as CapsuleShape
 
 from drake_teleop.lab.excitation.collision import (
-    CLEARANCE_M,
+    MIN_CLEARANCE_M,
     Capsule,
-    _exclude_coaxial,
-    _required_distance,
+    _exclude_coaxial_pairs,
+    _min_capsule_distance,
     bounding_capsule,
 )
 
@@ -63,11 +63,11 @@ def test_minimum_distance_subtracts_the_quartile_of_the_excess():
     """Shapes near contact, capsules 0 to 100 mm nearer: the correction is 25 mm."""
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
     nearer = touching - np.linspace(0.0, 0.1, 101)
-    kept = _required_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
-    assert kept == pytest.approx(CLEARANCE_M - 0.025)
+    kept = _min_capsule_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
+    assert kept == pytest.approx(MIN_CLEARANCE_M - 0.025)
     # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
-    assert _required_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
+    assert _min_capsule_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_only_near_shapes_at_a_constant_distance_are_measured_in_the_first_postures():
@@ -80,7 +80,7 @@ def test_only_near_shapes_at_a_constant_distance_are_measured_in_the_first_postu
     }
     before = {pair: of_pair.copy() for pair, of_pair in distances.items()}
     excluded = []
-    _exclude_coaxial(SimpleNamespace(Apply=excluded.append), distances)
+    _exclude_coaxial_pairs(SimpleNamespace(Apply=excluded.append), distances)
     coaxial, *others = distances
     assert len(excluded) == 1 and (distances[coaxial] == -0.02).all()
     for pair in others:

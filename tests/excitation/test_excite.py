@@ -85,16 +85,18 @@ def urdf(tmp_path):
 @pytest.mark.slow
 def test_design_for_the_slave_has_a_good_criterion_within_all_limits(slave, designed):
     assert designed.values["kappa_w10"] < 4.3
-    assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
+    assert designed.criterion_history[-1, 1] == pytest.approx(
+        designed.values["kappa_w10"], rel=0.01
+    )
     _, qd, qdd = designed.trajectory.evaluate(np.array([0.0, 6.0]))
     np.testing.assert_allclose([qd, qdd], 0, atol=1e-12)
-    names = {use.limit_name for use in designed.uses}
+    names = {use.limit_name for use in designed.limit_uses}
     assert names == {
         "position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance"
     }  # fmt: skip
-    assert all(0 < use.used_share <= 1 for use in designed.uses)
+    assert all(0 < use.used_share <= 1 for use in designed.limit_uses)
     # A limit must be active, otherwise the optimum would be larger.
-    assert designed.uses[0].used_share > 0.97
+    assert designed.limit_uses[0].used_share > 0.97
     assert slave.limits.heaviest_phi[0] == pytest.approx(1.3 * 3.13)
 
 
@@ -204,7 +206,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
 @pytest.mark.slow
 def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     motion = sensor_motion(slave, designed.trajectory)
-    predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.heaviest_phi)
+    predicted = predicted_deviations(*motion, 1e-3, slave.sensor_noise, slave.limits.heaviest_phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
     # Deviations: encoders only < fused < accelerometer only.
     encoders, fused, accelerometer = (
@@ -224,7 +226,7 @@ def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
 @pytest.mark.slow
 def test_check_finds_a_violation_of_each_limit(slave, short):
     """Each limit in turn is a little below its use by the same motion."""
-    uses = {use.limit_name: use.used_share for use in short.uses}
+    uses = {use.limit_name: use.used_share for use in short.limit_uses}
     limits = slave.limits
     # Without this clearance all pairs could be beyond the search distance.
     wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
@@ -294,7 +296,7 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
     named = next(text for text in found.assumptions if "no clearance required" in text)
     assert "l0 and l3" in named and "l0 and l6" not in named
     assert "l0 and l2" not in named  # they touch in all postures
-    still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
+    still = FourierTrajectory(found.home_posture, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
     assert all(use.used_share < 1 for use in check_trajectory(found, still))
     assert len(found.limits.capsule_pairs) > 0  # other pairs
 
@@ -304,7 +306,7 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
 def test_environment_of_the_scenario_is_avoided(name):
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
-    assert all(use.used_share <= 1 for use in found.uses)
+    assert all(use.used_share <= 1 for use in found.limit_uses)
     context = robot.diagram.CreateDefaultContext()
     of_plant = robot.plant.GetMyMutableContextFromRoot(context)
     of_scene = robot.scene_graph.GetMyContextFromRoot(context)
@@ -402,7 +404,7 @@ def test_links_that_always_touch_are_excluded(urdf):
     packages = (urdf.parent / "somewhere",)
     robot = RobotFromModel(urdf, "l6", WristSensorConfig(), package_paths=packages, payload=2.0)
     still = np.zeros((6, 2))
-    uses = check_trajectory(robot, FourierTrajectory(robot.home, still, still, 1.0))
+    uses = check_trajectory(robot, FourierTrajectory(robot.home_posture, still, still, 1.0))
     assert next(use for use in uses if use.limit_name == "clearance").used_share <= 1
 
 
@@ -734,8 +736,11 @@ def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, m
     designs = [] if found == "none" else [bad]
     monkeypatch.setattr(excite_module, "minimise_criterion", lambda *_, **__: designs)
     small = excite(slave, period=2.4, harmonics=2, progress=False)
-    np.testing.assert_array_equal(small.trajectory.q0, slave.home)
-    assert small.uses[0].used_share <= 1.0 and small.history.shape == (len(designs), 2)
+    np.testing.assert_array_equal(small.trajectory.q0, slave.home_posture)
+    assert small.limit_uses[0].used_share <= 1.0 and small.criterion_history.shape == (
+        len(designs),
+        2,
+    )
     assert np.isfinite(small.deviations[:10]).all()
 
 

@@ -28,7 +28,7 @@ from drake_teleop.lab.excitation.limits import (
 from drake_teleop.lab.excitation.optimizer import DesignProblem, DesignTask, _DescentSearch
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
-    _motion_error_filter,
+    _motion_error_polynomials,
     predicted_deviations,
 )
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -90,7 +90,7 @@ def test_unknown_criterion_error_lists_the_known_ones():
 def test_predicted_deviations_are_those_of_white_noise():
     """Scatter of weighted least squares over 400 draws; A16 and D16 from the same covariance."""
     samples = motion(200, seed=2)
-    sigma = np.repeat(SCALES.noise, 3)
+    sigma = np.repeat(SCALES.wrench_noise, 3)
     rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
     whitened = (rows / sigma[:, None]).reshape(-1, 16)
     errors = np.linalg.pinv(whitened) @ np.random.default_rng(3).standard_normal((1200, 400))
@@ -112,7 +112,7 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
     for gains in fusion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _motion_error_filter(gains, T)
+        numerator, denominator = _motion_error_polynomials(gains, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
@@ -183,7 +183,9 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     for k, unit in enumerate(np.eye(len(x))):
         ahead, behind = (problem.evaluate(x + sign * step * unit, 3.0, 5.0) for sign in (1, -1))
         of_criterion = ahead.log_criterion - behind.log_criterion
-        numeric = np.array([of_criterion, *(ahead.uses - behind.uses)]) / (2 * step)
+        numeric = np.array(
+            [of_criterion, *(ahead.smooth_limit_uses - behind.smooth_limit_uses)]
+        ) / (2 * step)
         np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
 
 

@@ -33,8 +33,8 @@ def slave() -> Robot:
 
 
 def problem_of(slave: Robot, times: float = 1.0) -> ShortestMotionProblem:
-    criterion = Criterion("A16", slave.scales)
-    task = DesignTask(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
+    criterion = Criterion("A16", slave.criterion_scales)
+    task = DesignTask(slave.arm.table, slave.limits, criterion, slave.home_posture, 1.0, 3)
     return ShortestMotionProblem(
         task, times * derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi), slave, None
     )
@@ -53,7 +53,10 @@ def test_gradients_equal_finite_differences(slave: Robot) -> None:
     at = problem.evaluate(x, 2.0, 100.0)
     for step in (1e-6 * rng.normal(size=len(x)), np.append(np.zeros(len(x) - 1), 1e-6)):
         up, down = (problem.evaluate(x + sign * step, 2.0, 100.0) for sign in (1, -1))
-        differences = [up.log_criterion - down.log_criterion, *(up.uses - down.uses)]
+        differences = [
+            up.log_criterion - down.log_criterion,
+            *(up.smooth_limit_uses - down.smooth_limit_uses),
+        ]
         np.testing.assert_allclose(differences, 2 * at.gradients @ step, rtol=1e-4, atol=1e-11)
 
 
@@ -64,7 +67,7 @@ def test_tolerance_use_follows_from_white_noise_over_the_period(slave: Robot) ->
     at = problem.evaluate(x, 200.0, 100.0)
     motion = tuple(problem._vectors.copy())
     worst = problem.deviations(motion, 2.0).max()
-    assert np.exp(2 * (at.uses[0] - 1)) == pytest.approx(worst, rel=0.01)
+    assert np.exp(2 * (at.smooth_limit_uses[0] - 1)) == pytest.approx(worst, rel=0.01)
     assert problem.deviations(motion, 8.0).max() == pytest.approx(worst / 2, rel=1e-6)
 
 
@@ -78,7 +81,7 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     )
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.errors_over_tolerances.max() <= 1.0
-    assert all(use.used_share <= 1.0 for use in found.excitation.uses)
+    assert all(use.used_share <= 1.0 for use in found.excitation.limit_uses)
 
 
 def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
@@ -90,7 +93,7 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)
     motion = sensor_motion(slave, problem.trajectory(x))
-    covariance = predicted_covariance(*motion, 1e-3, slave.noise, slave.limits.heaviest_phi)
+    covariance = predicted_covariance(*motion, 1e-3, slave.sensor_noise, slave.limits.heaviest_phi)
     known = problem.deviations(motion, 1.2)
     np.testing.assert_allclose(known, deviations_over_tolerances(errors, covariance), rtol=0.03)
 

@@ -47,7 +47,7 @@ EXPERIMENTS = (
     "simulate_free_motion",
     "simulate_ideal_motion",
     "simulate_contact",
-    "_measure_speed",
+    "_measure_simulation_speed",
 )
 
 

@@ -208,7 +208,7 @@ def test_dask_worker_of_another_version_is_refused_by_name(tmp_path, late, monke
 
     if late:
         monkeypatch.setattr(
-            "drake_teleop.lab.studies.processes._check_versions", lambda client: None
+            "drake_teleop.lab.studies.processes._check_worker_versions", lambda client: None
         )
     with LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster:
         address = cluster.scheduler_address

@@ -13,10 +13,10 @@ from drake_teleop.lab.comparison.delayed_contact import leaf_thickness
 from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
-    Settings,
     StationTrial,
+    TunedSettings,
     press_depth,
-    rms_above,
+    rms_above_hz,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
 from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
@@ -73,9 +73,9 @@ def test_firm_grip_presses_less_deeply_with_a_weak_device():
 def test_only_force_above_5_hz_counts_as_oscillation():
     t = np.arange(800) * 1e-3
     slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
-    assert rms_above(slow, 1e-3, 5.0) < 0.05
-    assert rms_above(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-    assert rms_above(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+    assert rms_above_hz(slow, 1e-3, 5.0) < 0.05
+    assert rms_above_hz(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above_hz(np.full(800, np.nan), 1e-3, 5.0) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,9 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
     assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(trial().stated.corners)
+    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(
+        trial().stated_set.corners
+    )
     assert not all(meets_requirements(row) for row in found.limit_runs)
 
 
@@ -139,7 +141,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
     stated = make_stated_set(["light", "firm"], [1.0], "press")
-    tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
+    tuned = TunedSettings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0
     assert tuned.wrist_sensor.bandwidth_hz == 100.0
@@ -160,7 +162,7 @@ def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path,
     monkeypatch.setattr(search, "CANDIDATE_METHODS", ("ledger", "wave"))
     monkeypatch.setattr(search, "CANDIDATE_SIGMAS", (0.0,))
     monkeypatch.setattr(search, "_LOW_PASSES_HZ", ())
-    monkeypatch.setattr(search, "_BISECTION_RATIO", 2.0)
+    monkeypatch.setattr(search, "_MAX_UNSTABLE_OVER_STABLE_GAMMA", 2.0)
     arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
     summary = tune("touch", tmp_path, progress=False, **arguments)
     tuned = LoadScenario(tmp_path / "tuned.yaml")

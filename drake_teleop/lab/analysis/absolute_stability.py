@@ -18,7 +18,7 @@ from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_imped
 RealArray = NDArray[np.float64]
 BooleanArray = NDArray[np.bool_]
 
-_ROUNDING_TOLERANCE = 1e-12  # relative to the terms that cancel in a criterion
+_RELATIVE_ROUNDING_ERROR = 1e-12  # relative to the terms that cancel in a criterion
 
 
 def llewellyn_criterion(H: Complex) -> RealArray:
@@ -40,9 +40,9 @@ def is_absolutely_stable(H: Complex) -> BooleanArray:
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
-        (h11.real >= -_ROUNDING_TOLERANCE * np.abs(h11))
-        & (h22.real >= -_ROUNDING_TOLERANCE * np.abs(h22))
-        & (llewellyn_criterion(H) >= -_ROUNDING_TOLERANCE * size)
+        (h11.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h11))
+        & (h22.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h22))
+        & (llewellyn_criterion(H) >= -_RELATIVE_ROUNDING_ERROR * size)
     )
 
 
@@ -51,7 +51,7 @@ def required_damping(H: Complex) -> RealArray:
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
-    loss = np.where(loss <= _ROUNDING_TOLERANCE * np.abs(product), 0.0, loss)
+    loss = np.where(loss <= _RELATIVE_ROUNDING_ERROR * np.abs(product), 0.0, loss)
     with np.errstate(divide="ignore", invalid="ignore"):
         through = np.where(loss > 0, loss / (2 * h22.real), 0.0)
     return np.where(h22.real < 0, np.inf, through) - h11.real
@@ -68,9 +68,9 @@ def is_passive(H: Complex) -> BooleanArray:
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
-        (h11.real >= -_ROUNDING_TOLERANCE * np.abs(h11))
-        & (h22.real >= -_ROUNDING_TOLERANCE * np.abs(h22))
-        & (raisbeck_criterion(H) >= -_ROUNDING_TOLERANCE * size)
+        (h11.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h11))
+        & (h22.real >= -_RELATIVE_ROUNDING_ERROR * np.abs(h22))
+        & (raisbeck_criterion(H) >= -_RELATIVE_ROUNDING_ERROR * size)
     )
 
 
@@ -253,14 +253,14 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
+_DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, RealArray]:
     diagonal = corners[..., 2] - corners[..., 0]
     right = (
         diagonal.real[..., None] / 2
-        + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS_IN_HALF_DIAGONALS
+        + np.abs(diagonal)[..., None] / 2 * _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS
     )
     middle = corners[..., 0] + 0.5j * diagonal.imag
     return middle[..., None] + right, np.hypot(right, diagonal.imag[..., None] / 2)

@@ -34,7 +34,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_LEAF_DEFLECTION_M = 5e-3  # m, displacement of the tip into the leaf
+_TIP_DEPTH_IN_LEAF_M = 5e-3  # m, displacement of the tip into the leaf
 
 
 def analyze_command(
@@ -185,7 +185,7 @@ def displacement_into_leaf(scenario: Scenario) -> list[float]:
         )
     tip = NominalSlave(scenario.slave).start_tip
     displacement = (
-        np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _LEAF_DEFLECTION_M] - tip
+        np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, _TIP_DEPTH_IN_LEAF_M] - tip
     )
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ displacement / scaling.translation_scale)

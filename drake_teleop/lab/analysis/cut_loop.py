@@ -24,13 +24,13 @@ from drake_teleop.lab.analysis.period_map import (
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _SEARCH_ANGLES_RAD = np.pi * np.logspace(-5, 0, 401)
-_POLE_ANGLE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+_ANGLE_OFFSETS_NEAR_POLES = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
-_MAX_CROSSINGS = 32
-_MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
+_MAX_GAIN_CROSSINGS = 32
+_MAX_GAIN_OF_NO_LOOP = 1e-9  # largest |L| that counts as no loop
 _MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS = 12, 30  # from 1/s
-_NUM_NEWTON_STEPS = 12
-_UNIT_CIRCLE_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
+_NUM_MULTIPLIER_NEWTON_STEPS = 12
+_DISTANCE_OF_MULTIPLIER_FROM_ONE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class CutLoop:
     closed_multipliers: Complex  #: (..., n) multipliers of the loop closed without delay
     period_s: Array  #: period of the hand [s], (...)
     #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    crossing_angles: Array
-    crossing_phases: Array  #: unwrapped phases of L at these angles
-    crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
+    gain_crossing_angles: Array
+    gain_crossing_phases: Array  #: unwrapped phases of L at these angles
+    gain_crossing_signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
     def from_multipliers(
@@ -51,13 +51,13 @@ class CutLoop:
     ) -> CutLoop:
         """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
         shape, n = opened.shape[:-1], opened.shape[-1]
-        found = np.zeros((3, *shape, _MAX_CROSSINGS))
+        found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _write_gain_crossings(
             opened.reshape(-1, n),
             closed.reshape(-1, n),
             np.full(shape, level).ravel(),
             _SEARCH_ANGLES_RAD,
-            found.reshape(3, -1, _MAX_CROSSINGS),
+            found.reshape(3, -1, _MAX_GAIN_CROSSINGS),
         )
         return cls(opened, closed, np.broadcast_to(period, shape), *found)
 
@@ -88,43 +88,45 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf."""
-    if np.abs(response).max() < _MIN_LOOP_GAIN:
+    if np.abs(response).max() < _MAX_GAIN_OF_NO_LOOP:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(_interpolate_steps(np.unwrap(angle), _crossing_fractions(log_gain)), 2 * np.pi)
+    lag = np.mod(
+        _interpolate_in_steps(np.unwrap(angle), _zero_crossing_fractions(log_gain)), 2 * np.pi
+    )
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    fraction = np.where(is_jump, np.nan, _crossing_fractions(angle))
-    factor = np.exp(-_interpolate_steps(log_gain, fraction))
+    fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
+    factor = np.exp(-_interpolate_in_steps(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _crossing_fractions(value: Array) -> Array:
+def _zero_crossing_fractions(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _interpolate_steps(value: Array, fraction: Array) -> Array:
+def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
 def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period_s)[..., None]
-    angles = loop.crossing_angles
-    turns = (loop.crossing_phases - D * angles) / (2 * np.pi)
+    angles = loop.gain_crossing_angles
+    turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open_multipliers) > 1 + _UNIT_CIRCLE_TOLERANCE).sum(axis=-1)
-    return outside - (loop.crossing_signs * around).sum(axis=-1).astype(np.int64)
+    outside = (np.abs(loop.open_multipliers) > 1 + _DISTANCE_OF_MULTIPLIER_FROM_ONE).sum(axis=-1)
+    return outside - (loop.gain_crossing_signs * around).sum(axis=-1).astype(np.int64)
 
 
 def delay_margin(loop: CutLoop) -> Array:
     """Return the shortest round-trip delay [s] at which the loop is unstable; inf: none."""
-    angles = loop.crossing_angles
-    inside = (angles > 0) & (angles < np.pi) & (loop.crossing_signs != 0)
-    steps = np.mod(loop.crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
+    angles = loop.gain_crossing_angles
+    inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)
+    steps = np.mod(loop.gain_crossing_phases, 2 * np.pi) / np.where(inside, angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period_s
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
@@ -161,12 +163,14 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
-    crossings = np.where(radius > 0, radius * np.exp(1j * rescaled_loop(high).crossing_angles), 0)
+    crossings = np.where(
+        radius > 0, radius * np.exp(1j * rescaled_loop(high).gain_crossing_angles), 0
+    )
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
     found = np.zeros(z.shape, dtype=bool)
     with np.errstate(all="ignore"):
-        for _ in range(_NUM_NEWTON_STEPS):
+        for _ in range(_NUM_MULTIPLIER_NEWTON_STEPS):
             to_open, to_closed = z[..., None] - opened, z[..., None] - closed
             P, M, delay_factor = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
             slope = P * (1 / to_open).sum(axis=-1) * (1 - delay_factor)
@@ -182,7 +186,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
 
 @njit(cache=True)
-def _loop_at(closed, opened, angle, radius):
+def _response_at(closed, opened, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
@@ -195,7 +199,7 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop_at(zeros, poles, 0.0, 1.0 + _UNIT_CIRCLE_TOLERANCE)
+        value = _response_at(zeros, poles, 0.0, 1.0 + _DISTANCE_OF_MULTIPLIER_FROM_ONE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
@@ -205,17 +209,19 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            size, phase = abs(value), _phase_nearest_to(value, last_phase)
+            size, phase = abs(value), _unwrap_phase(value, last_phase)
             if (size > level) != (last_size > level) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    if (abs(_loop_at(zeros, poles, middle, 1.0)) > level) == (last_size > level):
+                    if (abs(_response_at(zeros, poles, middle, 1.0)) > level) == (
+                        last_size > level
+                    ):
                         low = middle
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _phase_nearest_to(_loop_at(zeros, poles, low, 1.0), last_phase)
+                found[1, n, count] = _unwrap_phase(_response_at(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -226,10 +232,10 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
 
 @njit(cache=True)
 def _add_pole_angles(angles, poles):
-    more = np.empty(_POLE_ANGLE_OFFSETS.shape[0] * poles.shape[0])
+    more = np.empty(_ANGLE_OFFSETS_NEAR_POLES.shape[0] * poles.shape[0])
     count = 0
     for pole in poles:
-        for share in _POLE_ANGLE_OFFSETS:
+        for share in _ANGLE_OFFSETS_NEAR_POLES:
             angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
             if angles[0] < angle < math.pi:
                 more[count] = angle
@@ -241,7 +247,7 @@ def _add_pole_angles(angles, poles):
 def _add_gain_extremes(angles, poles, zeros, level):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
-        values[i] = _loop_at(zeros, poles, angles[i], 1.0)
+        values[i] = _response_at(zeros, poles, angles[i], 1.0)
     size = np.abs(values)
     more = np.empty(angles.shape[0])
     count = 0
@@ -252,13 +258,16 @@ def _add_gain_extremes(angles, poles, zeros, level):
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_NUM_GOLDEN_SECTION_STEPS):
                 a, b = (high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low))
-                at_a, at_b = (_loop_at(zeros, poles, a, 1.0), _loop_at(zeros, poles, b, 1.0))
+                at_a, at_b = (
+                    _response_at(zeros, poles, a, 1.0),
+                    _response_at(zeros, poles, b, 1.0),
+                )
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:
                     low = a
             more[count] = 0.5 * (low + high)
-            values = np.append(values, _loop_at(zeros, poles, more[count], 1.0))
+            values = np.append(values, _response_at(zeros, poles, more[count], 1.0))
             count += 1
     if count == 0:
         return angles, values
@@ -268,6 +277,6 @@ def _add_gain_extremes(angles, poles, zeros, level):
 
 
 @njit(cache=True)
-def _phase_nearest_to(value, near):
+def _unwrap_phase(value, near):
     phase = math.atan2(value.imag, value.real)
     return phase + 2.0 * math.pi * np.rint((near - phase) / (2.0 * math.pi))

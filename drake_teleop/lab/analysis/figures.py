@@ -42,7 +42,7 @@ WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
 COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
-_FIT_BAND_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
+_MAX_FITTED_OMEGA_RAD_S = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
 _POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
 _MEASUREMENT_MOTION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
@@ -145,13 +145,13 @@ def stiffest_stable_walls(H: Complex, axis: OneAxis, sampling: Sampling) -> dict
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
-        grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        grip: _find_stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
         for grip in GRIP_IMPEDANCES
     }
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
 
-def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
+def _find_stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
     stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)
@@ -161,7 +161,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 def transparency_values(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
     """Return displayed and ideal impedances, and the tracking bandwidth; `wall`: [N/m], [N s/m]."""
-    fitted = OMEGA <= _FIT_BAND_RAD_S
+    fitted = OMEGA <= _MAX_FITTED_OMEGA_RAD_S
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S_AT_OMEGA), "wall": wall[1] + wall[0] / S_AT_OMEGA}
     for name, environment in environments.items():

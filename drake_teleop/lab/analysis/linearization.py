@@ -55,18 +55,21 @@ _INPUT_PORTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench"
 _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
 # Displacements for differences: errors grow with their square, and with rounding over them.
-_ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
+_ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_COMMANDED_ACCELERATION_RAD_S2 = (
     20.0  # rad/s^2, requested of a joint: within the motors' torque
 )
 _JOINT_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
-_MAX_NEWTON_STEPS = 8  # of Newton's method
-_APPROACH_TIME_S, _REST_TIME_S = 0.3, 0.1  # s, motion to the operating point, rest there
-_MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
+_MAX_MOTION_PER_PERIOD_AT_REST = 1e-6  # motion per period at rest, relative to the displacements
+_MAX_EQUILIBRIUM_NEWTON_STEPS = 8  # of Newton's method
+_TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = (
+    0.3,
+    0.1,
+)  # s, motion to the operating point, rest there
+_MAX_STATES_FOR_DENSE_EIGENVALUES = 800  # states; more need the sparse eigenvalue search
 MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
-_MAX_EIGENVALUE_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
+_MAX_SEARCHED_EIGENVALUE_HZ = 100.0  # Hz, limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
@@ -94,8 +97,8 @@ class Linearization:
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
         rows, columns = (
-            self._find_indices(outputs, self.outputs),
-            self._find_indices(inputs, self.inputs),
+            self._find_component_indices(outputs, self.outputs),
+            self._find_component_indices(inputs, self.inputs),
         )
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
@@ -123,7 +126,7 @@ class Linearization:
         Above 800 states they are only those near the unit circle, up to 100 Hz.
         """
         A = self._state_matrix_with_delays()
-        if (size := A.shape[0]) <= _MAX_DENSE_STATES:
+        if (size := A.shape[0]) <= _MAX_STATES_FOR_DENSE_EIGENVALUES:
             values = np.linalg.eigvals(A.toarray())
         elif size > MAX_STATES:
             raise DrakeTeleopError(
@@ -133,7 +136,7 @@ class Linearization:
             )
         else:
             values = _find_eigenvalues_near_circle(
-                A.astype(complex).tocsc(), 2 * np.pi * _MAX_EIGENVALUE_FREQUENCY_HZ * self.dt
+                A.astype(complex).tocsc(), 2 * np.pi * _MAX_SEARCHED_EIGENVALUE_HZ * self.dt
             )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
@@ -180,7 +183,9 @@ class Linearization:
         )
 
     @staticmethod
-    def _find_indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+    def _find_component_indices(
+        names: str | Sequence[str], known: tuple[str, ...]
+    ) -> tuple[int, ...]:
         parts = _port_component_names(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
@@ -328,7 +333,7 @@ class _StateGroup:
 
 class _PeriodSimulator:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
-        _check_rates(scenario)
+        _check_rate_multiples(scenario)
         own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
@@ -340,8 +345,8 @@ class _PeriodSimulator:
         smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
-            _check_environment(self._diagram)
-            _remove_friction(self._diagram)
+            _check_linear_environment(self._diagram)
+            _remove_contact_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Error control would make the steps depend on the displacements.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
@@ -370,7 +375,7 @@ class _PeriodSimulator:
         # The sensor's memory follows from the other states; it is of order 1.
         sensed = [group.system_name == "wrist_sensor" for group in self._groups]
         counts = [len(group.difference_steps) for group in self._groups]
-        self._sizes = np.where(np.repeat(sensed, counts), _UNIT_STEP, self._steps)
+        self._sizes = np.where(np.repeat(sensed, counts), _LINEAR_STATE_STEP, self._steps)
         self.states = tuple(
             f"{g.system_name} {'' if g.discrete_group is None else g.discrete_group}[{k}]"
             for g in self._groups
@@ -379,7 +384,7 @@ class _PeriodSimulator:
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         self._simulator.Initialize()
 
     def _get_block(self, name: str) -> Any:
@@ -392,7 +397,7 @@ class _PeriodSimulator:
     def _evaluate_output(self, system: str, port: str) -> Array:
         return np.array(self._get_block(system).GetOutputPort(port).Eval(self._get_context(system)))
 
-    def _fix_input(self, system: str, port: str, value: object) -> None:
+    def _fix_input_port(self, system: str, port: str, value: object) -> None:
         self._get_block(system).GetInputPort(port).FixValue(self._get_context(system), value)
 
     def _make_state_groups(self) -> list[_StateGroup]:
@@ -409,7 +414,7 @@ class _PeriodSimulator:
             whole_group("master_device", 2, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
             _StateGroup("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
-            whole_group("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
+            whole_group("joint_control", 0, np.full(self._joints, _LINEAR_STATE_STEP)),
             _StateGroup(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
@@ -443,14 +448,16 @@ class _PeriodSimulator:
                 state.get_mutable_value()[group.indices] = values
         self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
-    def _apply_inputs(self, u: Array) -> None:
-        self._fix_input("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix_input("inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12]))
-        self._fix_input("force_display", "wrench_command", self._wrench + u[12:18])
+    def _apply_component_inputs(self, u: Array) -> None:
+        self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
+        self._fix_input_port(
+            "inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12])
+        )
+        self._fix_input_port("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
-        self._fix_input("slave_plant", "applied_spatial_force", [self._push])
-        self._fix_input("wrist_sensor", "applied_wrench_W", push)
+        self._fix_input_port("slave_plant", "applied_spatial_force", [self._push])
+        self._fix_input_port("wrist_sensor", "applied_wrench_W", push)
 
     def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
@@ -495,30 +502,30 @@ class _PeriodSimulator:
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._evaluate_output("kinematic_scaling", "pose_command")
-        ramp = round(_APPROACH_TIME_S / self.dt) if displacement.any() else 0
-        for k in range(ramp + round(_REST_TIME_S / self.dt)):
+        ramp = round(_TIME_TO_OPERATING_POINT_S / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_TIME_AT_OPERATING_POINT_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
-            self._apply_inputs(np.zeros(24))
+            self._apply_component_inputs(np.zeros(24))
             self._run_one_period()
-        return self._find_equilibrium(self._balance_hand_force())
+        return self._find_equilibrium_state(self._balance_hand_force())
 
     def _balance_hand_force(self) -> Array:
         self._wrench = self._evaluate_output("force_scaling", "wrench_B")
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         self._hand = -self._evaluate_output("force_display", "force_to_master")
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         return self.get_state()
 
-    def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
+    def _find_equilibrium_state(self, x: Array) -> tuple[Array, Array, Array]:
         slave = np.array([not name.startswith("master") for name in self.states])
-        for _ in range(_MAX_NEWTON_STEPS):
+        for _ in range(_MAX_EQUILIBRIUM_NEWTON_STEPS):
             A, C = self.differentiate_by_state(x)
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
             moved = self._run_one_period() - x
-            if (np.abs(moved) < _REST_TOLERANCE * self._sizes)[free].all():
+            if (np.abs(moved) < _MAX_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
@@ -532,7 +539,7 @@ class _PeriodSimulator:
 
     def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
-        self._apply_inputs(np.zeros(24))
+        self._apply_component_inputs(np.zeros(24))
         for k, step in enumerate(self._steps):
             ends, outputs = [], []
             for sign in (1.0, -1.0):
@@ -547,14 +554,14 @@ class _PeriodSimulator:
 
     def differentiate_by_input(self, x: Array) -> Array:
         B = np.empty((len(x), 24))
-        pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
+        pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
         for k, step in enumerate(
             np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
         ):
             ends = []
             for sign in (1.0, -1.0):
                 self._set_state(x)
-                self._apply_inputs(sign * step * np.eye(24)[k])
+                self._apply_component_inputs(sign * step * np.eye(24)[k])
                 ends.append(self._run_one_period())
             B[:, k] = (ends[0] - ends[1]) / (2 * step)
         return B
@@ -595,7 +602,7 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
     )
 
 
-def _check_environment(diagram: Diagram) -> None:
+def _check_linear_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
         raise DrakeTeleopError(
@@ -605,7 +612,7 @@ def _check_environment(diagram: Diagram) -> None:
         )
 
 
-def _remove_friction(diagram: Diagram) -> None:
+def _remove_contact_friction(diagram: Diagram) -> None:
     plant = GetBlock(diagram, "slave_plant")
     scene_graph = GetBlock(diagram, "scene_graph")
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
@@ -616,7 +623,7 @@ def _remove_friction(diagram: Diagram) -> None:
     GetBlock(diagram, "wrist_sensor").contact_pairs[:, PAIR_FRICTION_COLUMNS] = 0.0
 
 
-def _check_rates(scenario: Scenario) -> None:
+def _check_rate_multiples(scenario: Scenario) -> None:
     rates = scenario.rates
     if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
         raise DrakeTeleopError(

@@ -30,8 +30,10 @@ Array = NDArray[np.float64]
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"
 _PARAMETER_NAMES = {e.name for e in fields(OneAxis)} - {"ideal_servo"} | {RATE_NAME, "low_pass_hz"}
-_NUM_BISECTION_STEPS = 10
-_DISTORTION_BAND_RAD_S = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # of deliberate movements
+_NUM_STABILITY_LIMIT_BISECTIONS = 10
+_DISTORTION_FREQUENCIES_RAD_S = (
+    2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])
+)  # of deliberate movements
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def stability_map(
 
 
 def force_distortion(
-    axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND_RAD_S
+    axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_FREQUENCIES_RAD_S
 ) -> Array:
     """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
@@ -147,7 +149,7 @@ def _bisect_stability_limit(
     is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]
 ) -> Array:
     low, high = low.copy(), high.copy()
-    for _ in range(_NUM_BISECTION_STEPS if low.size else 0):
+    for _ in range(_NUM_STABILITY_LIMIT_BISECTIONS if low.size else 0):
         middle = 0.5 * (low + high)
         as_low = is_stable(middle) == stable_at_low
         low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)

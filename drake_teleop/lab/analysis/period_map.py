@@ -21,10 +21,10 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
-(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER) = range(7)
+(MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
-_HAND_FORCE, _ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
-_MAX_RATE_RATIO = 1000
+_HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
+_MAX_RATE_OVER_HAND = 1000
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _low_pass_sections(sampling)
-    n = FIRST_FILTER + 2 * sections.shape[-2]
+    n = FIRST_FILTER_STATE + 2 * sections.shape[-2]
     rows = _PeriodMapRows(axis, n + 3)
     hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
@@ -102,7 +102,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     delay_factor = z ** -delay_in_hand_periods(axis, sampling)
     # Responses without delay to a force on the device, and to one of the environment.
     C = np.eye(n)[[MASTER_V, SLAVE_V, SAMPLED_FORCE]]
-    response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
+    response = _transfer_matrix(M[:n, :n], M[:n, n : n + 2], C, z)
     (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
     hold = -np.expm1(-1j * w * period) / (1j * w * period)
     H = np.array(
@@ -118,11 +118,11 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (1 <= count <= _MAX_RATE_RATIO and (np.abs(ratios - count) <= 1e-9 * count).all()):
+    if not (1 <= count <= _MAX_RATE_OVER_HAND and (np.abs(ratios - count) <= 1e-9 * count).all()):
         raise DrakeTeleopError(
             "is no whole multiple of hand_hz",
             where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_RATIO} times as fast as the hand",
+            remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND} times as fast as the hand",
         )
     return count
 
@@ -158,11 +158,11 @@ class _PeriodMapRows:
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
-        x, v, push = _spring_response(0.0, axis.device_damping / mass, period)
+        x, v, push = _mass_spring_motion(0.0, axis.device_damping / mass, period)
         hand_force = {
             MASTER_X: -axis.hand_stiffness / mass,
             MASTER_V: -axis.hand_damping / mass,
-            _HAND_FORCE: 1 / mass,
+            _HELD_HAND_FORCE: 1 / mass,
         }
         force = self._make_row(hand_force) + self._make_row({RECEIVED_FORCE: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
@@ -182,14 +182,14 @@ class _PeriodMapRows:
         contact_force = {
             SLAVE_X: scale * axis.wall_stiffness,
             SLAVE_V: scale * axis.wall_damping,
-            _ENVIRONMENT_FORCE: scale,
+            _HELD_ENVIRONMENT_FORCE: scale,
         }
         load_force = {SERVO_A: axis.force_scale * felt_mass}
         value = self._make_row(contact_force) + self._make_row(load_force)
         memory = []
         for k in range(sections.shape[-2]):
             b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
-            first, second = FIRST_FILTER + 2 * k, FIRST_FILTER + 2 * k + 1
+            first, second = FIRST_FILTER_STATE + 2 * k, FIRST_FILTER_STATE + 2 * k + 1
             filtered = b0 * value + self._make_row({first: 1.0})
             memory.append(b1 * value - a1 * filtered + self._make_row({second: 1.0}))
             memory.append(b2 * value - a2 * filtered)
@@ -199,7 +199,7 @@ class _PeriodMapRows:
     def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
-        x, v, push = _spring_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
+        x, v, push = _mass_spring_motion(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
         rows = []
         for i in range(2):
             p = push[..., i]
@@ -209,14 +209,14 @@ class _PeriodMapRows:
                         SLAVE_X: x[..., i],
                         SLAVE_V: v[..., i],
                         SERVO_A: p,
-                        _ENVIRONMENT_FORCE: -p / mass,
+                        _HELD_ENVIRONMENT_FORCE: -p / mass,
                     }
                 )
             )
         return np.stack(rows, axis=-2)
 
 
-def _spring_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
+def _mass_spring_motion(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
     # (x, x') after `time` of x'' = u - b x' - k x, from x = 1, from x' = 1, and for u = 1.
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
@@ -237,7 +237,7 @@ def _matrix_exponential(M: Array) -> Array:
     return E
 
 
-def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
+def _transfer_matrix(A: Array, B: Array, C: Array, z: Complex) -> Complex:
     # C (z I - A)^-1 B, (N, p, m).
     balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
     T, Q = schur(balanced, output="complex")

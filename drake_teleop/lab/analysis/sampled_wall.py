@@ -16,7 +16,7 @@ from drake_teleop.lab.analysis.one_axis import Complex
 
 Array = NDArray[np.float64]
 
-_NUM_BISECTION_STEPS = 60
+_NUM_STIFFNESS_BISECTIONS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
@@ -38,11 +38,11 @@ def stable_stiffness(
 
     Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
-    _, held = _sampled_device(mass, damping, hand_stiffness, period)
+    _, held = _sampled_device_matrices(mass, damping, hand_stiffness, period)
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / held[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
-    for _ in range(_NUM_BISECTION_STEPS):
+    for _ in range(_NUM_STIFFNESS_BISECTIONS):
         middle = (low + high) / 2
         poles = sampled_poles(
             mass, damping, middle, wall_damping, period, hand_stiffness=hand_stiffness
@@ -65,7 +65,7 @@ def sampled_poles(
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )
-    state, held = _sampled_device(mass, damping, hand, period)
+    state, held = _sampled_device_matrices(mass, damping, hand, period)
     # States: position, velocity, last sampled position
     force = np.stack([K + B / period, np.zeros_like(B, dtype=float), -B / period], axis=-1)
     step = np.zeros((*mass.shape, 3, 3))
@@ -75,7 +75,7 @@ def sampled_poles(
     return np.linalg.eigvals(step).astype(complex)
 
 
-def _sampled_device(
+def _sampled_device_matrices(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
     from scipy.linalg import expm

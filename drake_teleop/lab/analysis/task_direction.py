@@ -111,13 +111,13 @@ def task_direction(
         sigma=sigma,
         gamma=gamma,
         delay=0.5 * (forward.delay + backward.delay),
-        wall_stiffness=_wall_stiffness(scenario),
+        wall_stiffness=_stiffness_of_leaf_or_wall(scenario),
         wall_damping=0.0 if sheet is None else float(sheet.damping),
     )
     return TaskDirection(axis, hand_B, tool_W, float(mass_acceleration / mobility))
 
 
-def _wall_stiffness(scenario: Scenario) -> float:
+def _stiffness_of_leaf_or_wall(scenario: Scenario) -> float:
     if scenario.first_sheet_spring is not None:
         return float(scenario.first_sheet_spring.stiffness)
     wall = scenario.surroundings

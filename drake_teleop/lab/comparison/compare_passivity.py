@@ -63,10 +63,10 @@ _INJECTED_ENERGY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0,
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _STATION_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
-_MAX_STEP_S = 2e-3
+_MAX_SIMULATION_STEP_S = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
-_SLIP_SPEED_M_S = 1e-3
+_LEAF_SLIP_SPEED_M_S = 1e-3
 
 
 def compare_command(
@@ -152,7 +152,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     """Return the scenario without environment, with the rates of the comparison."""
     return replace(
         LoadScenario(scenario).without_environment(),
-        simulation=Simulation(seed=seed, max_step=_MAX_STEP_S),
+        simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
         rates=_STATION_RATES,
         contact_detection=None,
     )
@@ -168,7 +168,7 @@ def simulate_press(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
+    setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)
@@ -217,7 +217,7 @@ def _run_one_dof_study(
     for method in methods:
         step_addresses(method)
     seeds = range(seed, seed + 2)
-    found = _run_parallel(
+    found = _run_in_processes(
         longest_round_trip,
         [(m, OneDof(wall_stiffness=wall), *impairment, seeds) for m, wall, impairment in cases],
         jobs,
@@ -240,7 +240,7 @@ def _run_release_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
-    found = _run_parallel(
+    found = _run_in_processes(
         simulate_release_and_taps,
         [(method, network, seed) for network, method in cases],
         jobs,
@@ -267,7 +267,7 @@ def _run_station_study(
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAF_THICKNESSES_M, methods))
-    results = _run_parallel(
+    results = _run_in_processes(
         simulate_press,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
@@ -308,7 +308,7 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     return rows
 
 
-def _run_parallel(
+def _run_in_processes(
     function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
 ) -> list[Any]:
     from joblib import Parallel, delayed

@@ -15,7 +15,7 @@ VERDICT_UNSTABLE, VERDICT_POSITION_ERROR, VERDICT_CHATTERS = (
     "chatters",
 )
 VERDICT_LEAKS, VERDICT_HOLDS = "leaks", "holds"
-MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
+MAX_POSITION_ERROR_M, MIN_LEAKED_ENERGY_J = 5e-3, 1e-3  #: m; J
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class MethodResult:
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
     """Return the result of each (method, network) in a summary."""
     return {
-        (row["method"], row["network"]): _summarise_runs(
+        (row["method"], row["network"]): _summarise_runs_of_method(
             [
                 run
                 for run in summary["station"]
@@ -57,19 +57,21 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
     }
 
 
-def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
+def _summarise_runs_of_method(
+    runs: Sequence[Mapping[str, Any]], leaked_by_hands: float
+) -> MethodResult:
     if not all(run["stable"] for run in runs):
         return MethodResult(
             VERDICT_UNSTABLE, motion_texts=tuple(map(_describe_motion_in_hold, runs))
         )
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
-    if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
+    if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:
         return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
     if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_N:
         return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
     return MethodResult(
-        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked_J=leaked
+        VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS, forces, leaked_J=leaked
     )
 
 

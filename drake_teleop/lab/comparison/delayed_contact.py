@@ -20,8 +20,8 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.plant import NominalSlave
 
-_START_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
-_LEAF_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
+_TIP_LEAF_GAP_M, _PRESS_DEPTH_M = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+_LEAF_SPRING_LENGTH_M, _LEAF_WIDTH_M = 0.12, 0.05  # m
 #: Leaves by name: thickness [m], light enough not to oscillate.
 LEAF_THICKNESSES_M = {"contact": 0.0015, "stiff contact": 0.00236}
 
@@ -65,7 +65,7 @@ def delayed_contact(
         rotation=[0.0, 0.05, 0.0],
     )
     scale = base.kinematic_scaling.translation_scale
-    reach = [0.0, 0.0, -(_START_GAP_M / scale + depth)]
+    reach = [0.0, 0.0, -(_TIP_LEAF_GAP_M / scale + depth)]
     press, retreat = (
         MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
         for start, end, translation in (
@@ -75,8 +75,8 @@ def delayed_contact(
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
     sheet = SheetSpring(
-        position=[x, y, z - _START_GAP_M],
-        length=_LEAF_LENGTH_M,
+        position=[x, y, z - _TIP_LEAF_GAP_M],
+        length=_LEAF_SPRING_LENGTH_M,
         width=_LEAF_WIDTH_M,
         thickness=LEAF_THICKNESSES_M[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
@@ -95,7 +95,7 @@ def delayed_contact(
 
 def leaf_thickness(stiffness: float) -> float:
     """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
-    unit = SheetSpring(length=_LEAF_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
+    unit = SheetSpring(length=_LEAF_SPRING_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 

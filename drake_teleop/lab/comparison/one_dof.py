@@ -30,8 +30,8 @@ from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: period of the channel [s]
-_SUBSTEPS_PER_PERIOD = 20
-_FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb friction
+_SUBSTEPS_PER_CHANNEL_PERIOD = 20
+_DEVICE_FRICTION_SPEED_M_S = 5e-3  # m/s, regularisation of the device's Coulomb friction
 _SLAVE_FRICTION_SPEED_M_S = 1e-3  # m/s, regularisation of the slave's friction
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
@@ -276,9 +276,11 @@ def figures_of_traces(
 
     hold = window_slice(task.release_start - task.rest_window, task.release_start)
     rest = window_slice(task.end - task.rest_window, task.end)
-    hunting = max(_detrended_range(x[part]) for x in (master, slave) for part in (hold, rest))
+    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max((_detrended_range(x[part]) for x in angles for part in (hold, rest)), default=0.0)
+    turning = max(
+        (_range_about_parabola(x[part]) for x in angles for part in (hold, rest)), default=0.0
+    )
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -318,7 +320,7 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float6
     return np.asarray(felt.real)
 
 
-def _detrended_range(x: NDArray[np.float64]) -> float:
+def _range_about_parabola(x: NDArray[np.float64]) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -351,7 +353,7 @@ def _simulate_steps(
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
-    dt = PERIOD / _SUBSTEPS_PER_PERIOD
+    dt = PERIOD / _SUBSTEPS_PER_CHANNEL_PERIOD
     for k in range(course.shape[0]):
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
@@ -376,16 +378,16 @@ def _simulate_steps(
         copy_into(rows[k], 7, ports, 4, 2)
         copy_into(rows[k], 9, accounts, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
-        for i in range(_SUBSTEPS_PER_PERIOD):
-            share = (i + 0.5) / _SUBSTEPS_PER_PERIOD
+        for i in range(_SUBSTEPS_PER_CHANNEL_PERIOD):
+            share = (i + 0.5) / _SUBSTEPS_PER_CHANNEL_PERIOD
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
             v_i = course[k, 1] + share * (course[following, 1] - course[k, 1])
             force = stiffness * (x_i - x) + damping * (v_i - v) + felt[0]
-            v += dt / mass * (force - friction * np.tanh(v / _FRICTION_SPEED_M_S))
+            v += dt / mass * (force - friction * np.tanh(v / _DEVICE_FRICTION_SPEED_M_S))
             x += dt * v
             x_then, v_then = x_s, v_s
             if ideal > 0.0:
-                x_s = before + (i + 1.0) / _SUBSTEPS_PER_PERIOD * (command - before)
+                x_s = before + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * (command - before)
                 v_new = (command - before) / PERIOD
                 a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
             else:
@@ -397,9 +399,9 @@ def _simulate_steps(
                     a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED_M_S)
                 v_s += dt * a_s
                 x_s += dt * v_s
-            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_PERIOD * PERIOD * v_w)
+            beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_positive_part(push_then, push) * (x_s - x_then)
+            work = -_mean_pushing_force(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -423,7 +425,7 @@ def _wall_force(stiffness, damping, depth, speed):
 
 
 @njit(cache=True)
-def _mean_positive_part(a, b):
+def _mean_pushing_force(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -21,8 +21,8 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 TAP_RATES_HZ = (1.0, 1.5)  #: Hz
-_NUM_TAPS, _TAP_AMPLITUDE_M = 8, 0.03  # number; m, amplitude about the wall's surface
-_TIME_AFTER_RELEASE_S = 2.0  # s, evaluated after letting go
+_NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
+_EVALUATED_TIME_AFTER_RELEASE_S = 2.0  # s, evaluated after letting go
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
         )
 
     release_time = 3.0 + 3 * round_trip
-    end = release_time + _TIME_AFTER_RELEASE_S
+    end = release_time + _EVALUATED_TIME_AFTER_RELEASE_S
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, rest_window=0.1)
     pressing = operator_intent(task)
     release_row = round(release_time / PERIOD)
@@ -61,7 +61,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     grip[release_row:] = 0.0
     released = simulate_hand(pressing, grip)
     after = released.master[release_row:]
-    tapping = [simulate_hand(_tap_intent(rate, round_trip)) for rate in TAP_RATES_HZ]
+    tapping = [simulate_hand(_intended_tap_motion(rate, round_trip)) for rate in TAP_RATES_HZ]
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
         release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),
@@ -75,10 +75,10 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     )
 
 
-def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
+def _intended_tap_motion(rate: float, round_trip: float) -> NDArray[np.float64]:
     t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
     moving = (t > 0.0) & (t < _NUM_TAPS / rate)
-    x = np.where(moving, -_TAP_AMPLITUDE_M * np.sin(2 * np.pi * rate * t), 0.0)
+    x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * rate * t), 0.0)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 

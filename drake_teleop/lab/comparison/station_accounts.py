@@ -27,7 +27,7 @@ from drake_teleop.station.slave.arm import (
 
 Array = NDArray[np.float64]
 
-_REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
+_SIGNALS_FOR_ENERGY_BALANCES = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
@@ -35,7 +35,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
     `MOTOR` is NaN if the log is slower than the joint control.
     """
-    if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
+    if missing := [name for name in _SIGNALS_FOR_ENERGY_BALANCES if name not in result]:
         raise DrakeTeleopError(
             f"lacks the signals {', '.join(missing)}, which the energy balances need",
             where="result",
@@ -49,7 +49,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _motion_scales(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -86,13 +86,13 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _motion_scales(scenario)
+    power = scenario.force_scaling.force_scale / _kinematic_scales(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
 def start_energy(scenario: Scenario) -> Array:
     """Return the passivity method's initial energy (2,) [J], for translation and rotation."""
-    scales = _motion_scales(scenario)
+    scales = _kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -101,7 +101,7 @@ def start_energy(scenario: Scenario) -> Array:
     )
 
 
-def _motion_scales(scenario: Scenario) -> Array:
+def _kinematic_scales(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return np.where(scales > 0.0, scales, 1.0)

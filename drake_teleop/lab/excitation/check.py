@@ -20,7 +20,7 @@ _SENSOR_NORM_NAMES = ("force", "torque", "specific force", "angular acceleration
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _DIFFERENCE_STEP_S = 1e-4
 # Search distance beyond the clearance [m].
-_CLEARANCE_SEARCH_MARGIN_M = 0.01
+_SHAPE_PAIR_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -70,15 +70,17 @@ def check_motion(
 ) -> list[LimitUse]:
     """Return the use of every limit by q, qd, qdd (T, n) at times t (T,) [s], largest first."""
     names, limits = robot.arm.joint_names, robot.limits
-    torque, sensor, workspace, clearance, nearest = _evaluate_motion(robot, q, qd, qdd, progress)
+    torque, sensor, workspace, clearance, nearest = _evaluate_limited_quantities(
+        robot, q, qd, qdd, progress
+    )
     uses = [
-        _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
-        _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
-        _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _largest_use("torque", np.abs(torque) / limits.max_torques, t, names),
-        _largest_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
-        _largest_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _largest_use("clearance", clearance[:, np.newaxis], t, ("",)),
+        _find_largest_limit_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
+        _find_largest_limit_use("velocity", np.abs(qd) / limits.velocity, t, names),
+        _find_largest_limit_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
+        _find_largest_limit_use("torque", np.abs(torque) / limits.max_torques, t, names),
+        _find_largest_limit_use("sensor", sensor / limits.max_sensor_norms, t, _SENSOR_NORM_NAMES),
+        _find_largest_limit_use("workspace", workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _find_largest_limit_use("clearance", clearance[:, np.newaxis], t, ("",)),
     ]
     uses[-1] = replace(uses[-1], where=nearest[int(np.argmax(clearance))])
     without_end = {"position": limits.q_half, "workspace": limits.box_half}
@@ -88,12 +90,14 @@ def check_motion(
     )
 
 
-def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> LimitUse:
+def _find_largest_limit_use(
+    limit: str, shares: Array, t: Array, names: tuple[str, ...]
+) -> LimitUse:
     when, which = np.unravel_index(np.argmax(shares), shares.shape)
     return LimitUse(limit, float(shares[when, which]), float(t[when]), names[which])
 
 
-def _evaluate_motion(
+def _evaluate_limited_quantities(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
 ) -> tuple[Array, Array, Array, Array, list[str]]:
     # Joint torques, sensor norms, uses of workspace and clearance, nearest shapes.
@@ -104,7 +108,7 @@ def _evaluate_motion(
     gravity = plant.gravity_field().gravity_vector()
     position, velocity = plant.GetPositions(context), np.zeros(plant.num_velocities())
     acceleration = velocity.copy()
-    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard_bodies(plant, frame_S))
+    M_S = plant.CalcSpatialInertia(context, frame_S, _bodies_outboard_of_sensor(plant, frame_S))
     body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
     torque, kinematics = np.empty(q.shape), np.empty((len(q), 3, 3))
     workspace = np.empty((len(q), limits.points_S.size))
@@ -128,18 +132,18 @@ def _evaluate_motion(
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = robot.scene_graph.get_query_output_port().Eval(scene_context)
         distance, words = _nearest_shape_pair(
-            robot, query, limits.clearance + _CLEARANCE_SEARCH_MARGIN_M
+            robot, query, limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
         )
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
             progress(k / len(q))
     progress(1.0)
-    sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
+    sensor = _norms_at_sensor(M_S, *kinematics.swapaxes(0, 1))
     return torque, sensor, workspace, clearance, nearest
 
 
-def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
+def _norms_at_sensor(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))
@@ -147,7 +151,7 @@ def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> 
     return np.linalg.norm([force, torque, s, alpha], axis=2).T
 
 
-def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
+def _bodies_outboard_of_sensor(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     found = [frame_S.body().index()]
     for body in found:

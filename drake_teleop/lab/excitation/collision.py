@@ -44,7 +44,7 @@ from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_plant
 
 # Vertices of the circumscribed polygon of a cylinder.
-_NUM_RIM_POINTS = 24
+_NUM_CYLINDER_RIM_POINTS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +91,11 @@ def _convex_hull_points(shape: Shape) -> Array:
         corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
         return corners * [shape.a(), shape.b(), shape.c()]
     if isinstance(shape, Cylinder):
-        angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
-        radius = shape.radius() / np.cos(np.pi / _NUM_RIM_POINTS)
+        angle = 2 * np.pi * np.arange(_NUM_CYLINDER_RIM_POINTS) / _NUM_CYLINDER_RIM_POINTS
+        radius = shape.radius() / np.cos(np.pi / _NUM_CYLINDER_RIM_POINTS)
         rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
         half = shape.length() / 2
-        ends = [np.column_stack([rim, np.full(_NUM_RIM_POINTS, z)]) for z in (-half, half)]
+        ends = [np.column_stack([rim, np.full(_NUM_CYLINDER_RIM_POINTS, z)]) for z in (-half, half)]
         return np.concatenate(ends)
     hull = shape.GetConvexHull()
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
@@ -109,23 +109,23 @@ def _distances_to_segment(ends: Array, points: Array) -> Array:
 
 
 #: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
-CLEARANCE_M = 0.005
+MIN_CLEARANCE_M = 0.005
 # Neighbours by design: pairs that are closer than the clearance in this share of random postures,
 # or whose distance varies by less than this [m].
-_NEIGHBOUR_SHARE, _MIN_DISTANCE_VARIATION_M = 0.95, 1e-3
+_NEIGHBOUR_TOUCHING_SHARE, _MIN_PAIR_DISTANCE_VARIATION_M = 0.95, 1e-3
 # Number of postures that show which shapes remain at a constant distance.
 _NUM_COAXIALITY_POSTURES = 20
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
-_CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
+_NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
 # Smallest number of postures near contact for a correction.
-_MIN_NEAR_POSTURES = 5
+_MIN_POSTURES_NEAR_CONTACT = 5
 # Share of postures below which near capsules count although their shapes were never near.
-_RARE_SHARE = 0.05
+_RARE_CONTACT_SHARE = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
-_HALF_SPACE_BOX, _HALF_SPACE_BOX_POSE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_BOX_FOR_HALF_SPACE, _POSE_OF_BOX_FOR_HALF_SPACE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
 _MAX_SHAPE_SIZE_M = 1e3  # at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
@@ -188,19 +188,19 @@ class CollisionScene:
             q[self.arm.position_index] = posture
             self.plant.SetPositions(plant_context, q)
             query = self.scene_graph.get_query_output_port().Eval(scene_context)
-            for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(_NEAR_CONTACT_GAPS_M[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
             if k + 1 == _NUM_COAXIALITY_POSTURES:
                 in_context = self.scene_graph.collision_filter_manager(scene_context)
-                _exclude_coaxial(in_context, distances)
+                _exclude_coaxial_pairs(in_context, distances)
         # A new manager: declarations of a manager older than the context have no effect there.
         manager = self.scene_graph.collision_filter_manager()
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
-            constant = of_pair.max() < of_pair.min() + _MIN_DISTANCE_VARIATION_M
-            neighbours = constant or np.mean(of_pair < CLEARANCE_M) >= _NEIGHBOUR_SHARE
-            touch = start is not None and of_all[-1] < CLEARANCE_M
+            constant = of_pair.max() < of_pair.min() + _MIN_PAIR_DISTANCE_VARIATION_M
+            neighbours = constant or np.mean(of_pair < MIN_CLEARANCE_M) >= _NEIGHBOUR_TOUCHING_SHARE
+            touch = start is not None and of_all[-1] < MIN_CLEARANCE_M
             if touch and not neighbours:
                 frames = map(self.scene_graph.model_inspector().GetFrameId, (a, b))
                 names = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
@@ -223,7 +223,7 @@ class CollisionScene:
         write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
         for shape in sorted(
-            {shape for pair in candidates for shape in pair}, key=_identifier_number
+            {shape for pair in candidates for shape in pair}, key=_number_of_shape_id
         ):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
@@ -234,7 +234,7 @@ class CollisionScene:
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
-        outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
+        outer_shapes = sorted({outer[shape] for shape in outer}, key=_number_of_shape_id)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
@@ -251,44 +251,52 @@ class CollisionScene:
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _required_distance(shape_distances[a, b], capsules_apart[:, k])
-            near = shape_distances[a, b] < CLEARANCE_M
+            distance = _min_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
+            near = shape_distances[a, b] < MIN_CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
-            if near.sum() >= _MIN_NEAR_POSTURES:
+            if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE_M) < _RARE_SHARE
+                useful = (
+                    near.any()
+                    or 0 < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M) < _RARE_CONTACT_SHARE
+                )
             if useful:
                 used.append(k)
                 distances.append(distance)
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _required_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _min_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
+    touching = (of_shapes > _NEAR_CONTACT_GAPS_M[0]) & (of_shapes < _NEAR_CONTACT_GAPS_M[1])
     excess = (
         (of_shapes - capsules_apart)[touching]
-        if touching.sum() >= _MIN_NEAR_POSTURES
+        if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT
         else np.zeros(1)
     )
-    free = capsules_apart[of_shapes > CLEARANCE_M]
+    free = capsules_apart[of_shapes > MIN_CLEARANCE_M]
     return float(
-        min(CLEARANCE_M - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
+        min(
+            MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),
+            np.quantile(free, _BLOCKABLE_POSTURE_SHARE),
+        )
     )
 
 
-def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_ShapePair, Array]) -> None:
+def _exclude_coaxial_pairs(
+    manager: CollisionFilterManager, distances: dict[_ShapePair, Array]
+) -> None:
     # Drake's query is slow for pairs of shapes that are near at a constant distance.
     for (a, b), of_pair in distances.items():
         first = of_pair[:_NUM_COAXIALITY_POSTURES]
-        if first.max() < min(CLEARANCE_M, first.min() + _MIN_DISTANCE_VARIATION_M):
+        if first.max() < min(MIN_CLEARANCE_M, first.min() + _MIN_PAIR_DISTANCE_VARIATION_M):
             of_pair[:] = first[0]
             exclude = CollisionFilterDeclaration().ExcludeBetween
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
 
 
-def _identifier_number(shape: GeometryId) -> int:
+def _number_of_shape_id(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
@@ -297,7 +305,7 @@ def _shape_with_enclosing_capsule(
 ) -> GeometryId:
     row, capsule = capsules[shape]
     holding = [
-        (other.radius, -_identifier_number(name), name)
+        (other.radius, -_number_of_shape_id(name), name)
         for name, (other_row, other) in capsules.items()
         if other_row == row and other.contains(capsule)
     ]
@@ -361,5 +369,5 @@ def _add_shape(
     plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
 ) -> None:
     if isinstance(shape, HalfSpace):
-        X_BG, shape = X_BG @ _HALF_SPACE_BOX_POSE, _HALF_SPACE_BOX
+        X_BG, shape = X_BG @ _POSE_OF_BOX_FOR_HALF_SPACE, _BOX_FOR_HALF_SPACE
     plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())

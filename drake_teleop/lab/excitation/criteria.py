@@ -23,28 +23,28 @@ from drake_teleop.load.regressor import regressor
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
 #: Sample rate of A16 and D16 [Hz].
-SAMPLE_RATE_HZ = 1000.0
+INFORMATION_SAMPLE_RATE_HZ = 1000.0
 
 # Acceptable errors: relative mass and mean moment of inertia, centre of mass [m], offsets [N, N m].
-_MASS_ERROR, _INERTIA_ERROR = 0.01, 0.1
-_COM_ERROR_M = 1e-3
-_OFFSET_ERRORS = (0.1, 0.005)
+_MAX_RELATIVE_MASS_ERROR, _MAX_RELATIVE_INERTIA_ERROR = 0.01, 0.1
+_MAX_COM_ERROR_M = 1e-3
+_MAX_OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
-_MIN_EIGENVALUE_RATIO = 1e-13
+_MIN_RATIO_OF_EXCITED_EIGENVALUES = 1e-13
 
 
 class CriterionScales(NamedTuple):
     """Noise, length and load that scale the criteria.
 
     Attributes:
-        noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
+        wrench_noise: standard deviations (sigma_f [N], sigma_tau [N m]), white at 1 kHz.
         length: characteristic length L [m] of kappa_w10.
-        phi: (10,) nominal load about the origin of S, for A16 and D16.
+        nominal_phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
-    noise: tuple[float, float]
+    wrench_noise: tuple[float, float]
     length: float
-    phi: Array
+    nominal_phi: Array
 
 
 def characteristic_length(phi: Array) -> float:
@@ -66,13 +66,13 @@ class Criterion:
         self.name = name
         self.with_offsets = name.endswith("16")
         whitened = name in ("kappa_w10", "A16", "D16")
-        sigma = scales.noise if whitened else (1.0, 1.0)
+        sigma = scales.wrench_noise if whitened else (1.0, 1.0)
         self._rows = np.repeat(1 / np.array(sigma), 3)
         columns = np.ones(16 if self.with_offsets else 10)
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable_errors(scales.phi)
+            columns = _acceptable_errors(scales.nominal_phi)
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
@@ -87,12 +87,12 @@ class Criterion:
         """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
         _, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
+        if eigenvalues[0] <= _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
-        return float(np.exp(log_value) / np.sqrt(SAMPLE_RATE_HZ * duration))
+        return float(np.exp(log_value) / np.sqrt(INFORMATION_SAMPLE_RATE_HZ * duration))
 
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
@@ -100,7 +100,7 @@ class Criterion:
         """Return the smooth logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
+        eigenvalues = np.maximum(eigenvalues, _MIN_RATIO_OF_EXCITED_EIGENVALUES * eigenvalues[-1])
         value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = (vectors * weights) @ vectors.T
         if self.name == "A16":
@@ -121,8 +121,8 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, top_weights = _smooth_max(logs, sharpness)
-        bottom, bottom_weights = _smooth_max(-logs, sharpness)
+        top, top_weights = _smooth_maximum_and_weights(logs, sharpness)
+        bottom, bottom_weights = _smooth_maximum_and_weights(-logs, sharpness)
         return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
@@ -149,12 +149,19 @@ def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
 
 
 def _acceptable_errors(phi: Array) -> Array:
-    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_OFFSET_ERRORS, 3)
-    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
+    inertia = _MAX_RELATIVE_INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_MAX_OFFSET_ERRORS, 3)
+    return np.array(
+        [
+            *offsets,
+            _MAX_RELATIVE_MASS_ERROR * phi[0],
+            *3 * [_MAX_COM_ERROR_M * phi[0]],
+            *6 * [inertia],
+        ]
+    )
 
 
-def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:
+def _smooth_maximum_and_weights(values: Array, sharpness: float) -> tuple[float, Array]:
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()

@@ -31,9 +31,9 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
-_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
+_MOTION_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
-_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKS = 1.05, 30
+_MIN_CRITERION_RATIO_OF_CANDIDATES, _MAX_CHECKED_CANDIDATES = 1.05, 30
 # If no candidate passes: amplitudes of motions about the start posture, and their number.
 _FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
 _CONVEX_HULL_ADVICE = (
@@ -49,9 +49,9 @@ class Excitation:
     Attributes:
         values: value of every criterion.
         deviations: (16,) predicted standard deviations of offsets and phi with the heaviest load.
-        uses: use of every limit, largest first.
-        history: (K, 2) number of evaluations, best criterion so far.
-        seconds: thread CPU time of the design [s].
+        limit_uses: use of every limit, largest first.
+        criterion_history: (K, 2) number of evaluations, best criterion so far.
+        design_cpu_time_s: thread CPU time of the design [s].
     """
 
     robot: Robot
@@ -59,9 +59,9 @@ class Excitation:
     criterion: str
     values: dict[str, float]
     deviations: Array
-    uses: list[LimitUse]
-    history: Array
-    seconds: float
+    limit_uses: list[LimitUse]
+    criterion_history: Array
+    design_cpu_time_s: float
 
 
 def excite(
@@ -82,8 +82,8 @@ def excite(
     task = DesignTask(
         robot.arm.table,
         robot.limits,
-        Criterion(criterion, robot.scales),
-        robot.home,
+        Criterion(criterion, robot.criterion_scales),
+        robot.home_posture,
         period,
         harmonics,
     )
@@ -119,7 +119,7 @@ def assemble_excitation(
         predicted_deviations(
             *sensor_motion(robot, trajectory),
             1 / CHECK_RATE_HZ,
-            robot.noise,
+            robot.sensor_noise,
             robot.limits.heaviest_phi,
         ),
         uses,
@@ -160,7 +160,8 @@ def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, f
     """Return the value of every criterion at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
-        name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
+        name: Criterion(name, robot.criterion_scales).value(*motion, trajectory.period)
+        for name in CRITERIA
     }
 
 
@@ -183,13 +184,13 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
         if iterate.criterion_value < _MIN_CRITERION_RATIO_OF_CANDIDATES * last[iterate.start_index]:
             continue
         last[iterate.start_index] = iterate.criterion_value
-        for factor in _SHRINK_FACTORS:
+        for factor in _MOTION_SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_limit_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
-        if checks == _MAX_CHECKS:
+        if checks == _MAX_CHECKED_CANDIDATES:
             return
 
 
@@ -203,7 +204,7 @@ def _shrinking_motions_at_start(
     motions += [problem.trajectory(x) for x in random]
     for factor in _FALLBACK_AMPLITUDE_FACTORS:
         for motion in motions:
-            small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
+            small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home_posture)
             # The last use is that of capsules; `check_trajectory` measures the true clearance.
             if _largest_limit_uses(robot, small)[:-1].max() <= 1:
                 yield small

@@ -28,9 +28,9 @@ LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "work
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
 ZERO_USE_CLEARANCE_MARGIN_M = 0.1
 # Smallest weight in the gradient of a smooth maximum.
-_MIN_GRADIENT_WEIGHT = 1e-7
+_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7
 # Value that replaces all distances above clearance plus scale [m].
-_FAR_DISTANCE_M = 1.0
+_DISTANCE_OF_FAR_CAPSULES_M = 1.0
 
 
 class Limits(NamedTuple):
@@ -129,7 +129,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
             for j in range(n):
                 x = values[t, j] - limits.q_middle[j] if k == 0 else values[t, j]
                 use[t, j], sign[t, j] = abs(x) / scale[j], np.sign(x) / scale[j]
-        largest[k], smooth[k] = _smooth_maximum(use, sharpness)
+        largest[k], smooth[k] = _exact_and_smooth_maximum(use, sharpness)
         for t in range(T):
             for j in range(n):
                 gradient[k, k, t, j] = use[t, j] * sign[t, j]
@@ -151,7 +151,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 
 @njit(cache=True)
-def _smooth_maximum(use, sharpness):
+def _exact_and_smooth_maximum(use, sharpness):
     """Return exact and smooth maximum of `use` (T, m); replace `use` by the gradient."""
     top = use.max()
     total = 0.0
@@ -178,9 +178,9 @@ def _write_torque_use(
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):
             use[t, j] = abs(tau[t, j]) / limits.max_torques[j]
-    largest[3], smooth[3] = _smooth_maximum(use, sharpness)
+    largest[3], smooth[3] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_GRADIENT_WEIGHT:
+        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seeds[:] = 0.0
         for j in range(n):
@@ -218,10 +218,10 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
             size[t, k] = np.sqrt(a * a + b * b + c * c)
             use[t, k] = size[t, k] / limits.max_sensor_norms[k]
-    largest[4], smooth[4] = _smooth_maximum(use, sharpness)
+    largest[4], smooth[4] = _exact_and_smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
-        if use[t].max() < _MIN_GRADIENT_WEIGHT:
+        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(4):
@@ -251,9 +251,9 @@ def _write_workspace_use(
                 x = motion[9 + i] + p[i] - limits.box_middle[i]
                 use[t, 3 * k + i] = abs(x) / limits.box_half[i]
                 sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
-    largest[5], smooth[5] = _smooth_maximum(use, sharpness)
+    largest[5], smooth[5] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_GRADIENT_WEIGHT:
+        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(P):
@@ -283,19 +283,19 @@ def _write_clearance_use(
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance = _FAR_DISTANCE_M
-            if not _is_farther_apart(ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M):
+            distance = _DISTANCE_OF_FAR_CAPSULES_M
+            if not _are_segments_apart(ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M):
                 distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
             use[t, k] = (
                 1.0 - (distance - limits.min_pair_distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
             )
-    largest[6], smooth[6] = _smooth_maximum(use, sharpness)
+    largest[6], smooth[6] = _exact_and_smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _MIN_GRADIENT_WEIGHT:
+        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _MIN_GRADIENT_WEIGHT:
+            if use[t, k] < _MIN_SMOOTH_MAXIMUM_WEIGHT:
                 continue
             a, b = limits.capsule_pairs[k]
             _segment_distance(ends[t, a], ends[t, b], nearest)
@@ -341,7 +341,7 @@ def _transform_capsules(motions, rows, ends, placed):
 
 
 @njit(cache=True)
-def _is_farther_apart(first, second, distance):
+def _are_segments_apart(first, second, distance):
     # Sufficient condition for two segments (2, 3).
     between = length_a = length_b = 0.0
     for i in range(3):

@@ -26,8 +26,8 @@ from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SI
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
-_S_START, _OMEGA_START, _ALPHA_START, _P_START, _THETA_START = 0, 3, 6, 9, 12
-_VIRTUAL_V_START, _VIRTUAL_W_START = 15, 18
+_S_IN_SEED, _OMEGA_IN_SEED, _ALPHA_IN_SEED, _P_IN_SEED, _THETA_IN_SEED = 0, 3, 6, 9, 12
+_VIRTUAL_V_IN_SEED, _VIRTUAL_W_IN_SEED = 15, 18
 
 
 @njit(cache=True)
@@ -45,21 +45,21 @@ def add_vector_to_seed(motion, place, gradient, seed):
     """Add to a link's `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in its frame."""
     g = rotate_to_world(motion, gradient)
     add_into(seed, place, g)
-    add_into(seed, _THETA_START, cross(g, vector_at(motion, place)))
+    add_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, place)))
 
 
 @njit(cache=True)
 def add_point_to_seed(motion, point, gradient, seed):
     """Add to a link's `seed` a derivative, in W, by the position of a point (3,) fixed to it."""
-    add_into(seed, _P_START, gradient)
-    add_into(seed, _THETA_START, cross(rotate_to_world(motion, point), gradient))
+    add_into(seed, _P_IN_SEED, gradient)
+    add_into(seed, _THETA_IN_SEED, cross(rotate_to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
     """Add to a link's `seed` (21,) derivatives by the wrench of its load phi, both in its frame."""
-    s = rotate_to_link(motion, vector_at(motion, _S_START))
-    w = rotate_to_link(motion, vector_at(motion, _OMEGA_START))
+    s = rotate_to_link(motion, vector_at(motion, _S_IN_SEED))
+    w = rotate_to_link(motion, vector_at(motion, _OMEGA_IN_SEED))
     h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     lever = cross(g_torque, h)
     gs = plus(scale_vector(phi[0], g_force), lever)
@@ -68,9 +68,9 @@ def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
     gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
     gw = plus(gw, cross(apply_matrix(inertia, w), g_torque))
     gw = plus(gw, apply_matrix(inertia, cross(g_torque, w)))
-    add_vector_to_seed(motion, _S_START, gs, seed)
-    add_vector_to_seed(motion, _OMEGA_START, gw, seed)
-    add_vector_to_seed(motion, _ALPHA_START, ga, seed)
+    add_vector_to_seed(motion, _S_IN_SEED, gs, seed)
+    add_vector_to_seed(motion, _OMEGA_IN_SEED, gw, seed)
+    add_vector_to_seed(motion, _ALPHA_IN_SEED, ga, seed)
     return s, w
 
 
@@ -84,7 +84,7 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
     v = w = p = (0.0, 0.0, 0.0)
     for row in range(n + 1):
         motion, phi = motions[row], table[row, 12:22]
-        here = vector_at(motion, _P_START)
+        here = vector_at(motion, _P_IN_SEED)
         v = plus(v, cross(w, minus(here, p)))
         p = here
         if row < n:
@@ -97,16 +97,16 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
         virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
         v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
         s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
-        alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_START))
+        alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_IN_SEED))
         h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
         force = plus(scale_vector(phi[0], s), cross(alpha, h))
         force = plus(force, cross(omega, cross(omega, h)))
         torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
         torque = plus(torque, cross(h, s))
         F, N = rotate_to_world(motion, force), rotate_to_world(motion, torque)
-        add_into(seeds[row], _VIRTUAL_V_START, F)
-        add_into(seeds[row], _VIRTUAL_W_START, N)
-        add_into(seeds[row], _THETA_START, plus(cross(F, v), cross(N, w)))
+        add_into(seeds[row], _VIRTUAL_V_IN_SEED, F)
+        add_into(seeds[row], _VIRTUAL_W_IN_SEED, N)
+        add_into(seeds[row], _THETA_IN_SEED, plus(cross(F, v), cross(N, w)))
 
 
 @njit(cache=True)
@@ -121,14 +121,14 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd
     for row in range(n, -1, -1):
         motion, seed = motions[row], seeds[row]
         inboard = motions[row - 1] if row > 0 else still
-        w, a = vector_at(inboard, _OMEGA_START), vector_at(inboard, _ALPHA_START)
-        gs, gw = plus(gs, vector_at(seed, _S_START)), plus(gw, vector_at(seed, _OMEGA_START))
-        ga, gp = plus(ga, vector_at(seed, _ALPHA_START)), plus(gp, vector_at(seed, _P_START))
+        w, a = vector_at(inboard, _OMEGA_IN_SEED), vector_at(inboard, _ALPHA_IN_SEED)
+        gs, gw = plus(gs, vector_at(seed, _S_IN_SEED)), plus(gw, vector_at(seed, _OMEGA_IN_SEED))
+        ga, gp = plus(ga, vector_at(seed, _ALPHA_IN_SEED)), plus(gp, vector_at(seed, _P_IN_SEED))
         gt, gv = (
-            plus(gt, vector_at(seed, _THETA_START)),
-            plus(gv, vector_at(seed, _VIRTUAL_V_START)),
+            plus(gt, vector_at(seed, _THETA_IN_SEED)),
+            plus(gv, vector_at(seed, _VIRTUAL_V_IN_SEED)),
         )
-        go = plus(go, vector_at(seed, _VIRTUAL_W_START))
+        go = plus(go, vector_at(seed, _VIRTUAL_W_IN_SEED))
         z, slides = (motion[14], motion[17], motion[20]), table[row, IS_PRISMATIC_COLUMN] != 0.0
         if row < n and slides:
             gz = plus(scale_vector(qdd[row], gs), scale_vector(2.0 * qd[row], cross(gs, w)))
@@ -151,7 +151,7 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd
         if row < n and slides:
             g_q[row] += dot(z, gr)
         if row > 0:
-            r = minus(vector_at(motion, _P_START), vector_at(inboard, _P_START))
+            r = minus(vector_at(motion, _P_IN_SEED), vector_at(inboard, _P_IN_SEED))
             gw = plus(gw, plus(cross(cross(w, r), gs), cross(r, turned)))
             ga = plus(ga, cross(r, gs))
             go = plus(go, cross(r, gv))

@@ -29,7 +29,7 @@ from drake_teleop.station.replay_file import (
 
 _TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
-_LINK_RADIUS_RATIO = 0.04  # radius of a bone over its length
+_LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
 # Camera position from the middle of the motion, in sizes of the arm.
 _CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
 
@@ -99,7 +99,7 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
             () if visuals else _outboard_joint_points(robot, context, body)
         ):
             name, length = f"/arm/{k}/bone_{number}", float(np.linalg.norm(p_BJ))
-            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_RATIO * length, length), _LINK_COLOUR)
+            meshcat.SetObject(name, Cylinder(_LINK_RADIUS_TO_LENGTH * length, length), _LINK_COLOUR)
             along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
             meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 

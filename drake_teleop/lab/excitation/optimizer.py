@@ -30,9 +30,9 @@ Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
 # Samples of a period per harmonic.
-_SAMPLES_PER_HARMONIC = 24
+_SAMPLES_PER_PERIOD_AND_HARMONIC = 24
 # Size of random motions, as a share of the speed and acceleration limits.
-_RANDOM_MOTION_SHARE = 0.35
+_RANDOM_MOTION_LIMIT_SHARE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +60,13 @@ class Evaluation:
 
     Attributes:
         log_criterion: smooth logarithm of the criterion.
-        uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
+        smooth_limit_uses: (7,) smooth largest use of each of `LIMIT_NAMES`.
         gradients: (8, unknowns) gradients of criterion (first) and uses.
         largest_limit_use: exact largest use of any limit.
     """
 
     log_criterion: float
-    uses: Array
+    smooth_limit_uses: Array
     gradients: Array
     largest_limit_use: float
 
@@ -77,7 +77,7 @@ class DesignProblem:
     def __init__(self, task: DesignTask) -> None:
         self.task = task
         n, free = len(task.home_posture), 2 * (task.num_harmonics - 1)
-        samples = _SAMPLES_PER_HARMONIC * task.num_harmonics
+        samples = _SAMPLES_PER_PERIOD_AND_HARMONIC * task.num_harmonics
         unit = np.eye(free)
         basis = FourierTrajectory.at_rest(
             np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period_s
@@ -100,7 +100,7 @@ class DesignProblem:
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
         spread = np.tile(
             np.repeat(
-                _RANDOM_MOTION_SHARE * np.minimum(size, limits.q_half), task.num_harmonics - 1
+                _RANDOM_MOTION_LIMIT_SHARE * np.minimum(size, limits.q_half), task.num_harmonics - 1
             ),
             2,
         )
@@ -154,10 +154,10 @@ class DesignProblem:
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 USABLE_LIMIT_SHARE = 0.985
 # Largest use of a feasible iterate on the grid.
-_MAX_FEASIBLE_USE = 0.9885
+_MAX_LIMIT_USE_OF_FEASIBLE_MOTION = 0.9885
 
 # Number of candidates in a batch, and number of them from which a descent starts.
-_NUM_CANDIDATES, _NUM_DESCENT_STARTS = 128, 8
+_START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
@@ -165,9 +165,9 @@ _SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 _SLSQP_TOLERANCE = 1e-5
 # A start ends without a feasible iterate after so many evaluations, or after the first stage of
 # SLSQP outside this factor of the best.
-_MAX_INFEASIBLE_EVALUATIONS, _MAX_RATIO_TO_BEST = 250, 1.08
+_MAX_INFEASIBLE_EVALUATIONS, _MAX_CRITERION_RATIO_TO_BEST = 250, 1.08
 # A bounded descent is repeated while it improves the criterion by this factor.
-_MIN_IMPROVEMENT = 0.995
+_MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
 
 
 @dataclass(frozen=True)
@@ -237,13 +237,13 @@ class _DescentSearch:
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
         while True:
             batch = [
-                self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)
+                self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_START_BATCH_SIZE)
             ]
             merit = []
             for x in batch:
                 self._count_evaluation()
                 point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
-                merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+                merit.append(point.log_criterion + 10 * max(point.smooth_limit_uses.max() - 1, 0))
             for k in np.argsort(merit)[:_NUM_DESCENT_STARTS]:
                 yield batch[k]
 
@@ -257,12 +257,12 @@ class _DescentSearch:
             ).x
         is_bounded = self._problem.bounds(x) is not None
         for k, stage in enumerate(_SLSQP_STAGES):
-            hopeless = self._best_of_start > _MAX_RATIO_TO_BEST * self._best
+            hopeless = self._best_of_start > _MAX_CRITERION_RATIO_TO_BEST * self._best
             if k > 0 and hopeless and not is_bounded:
                 return
             x = self._run_slsqp(x, *stage)
         before = float("inf")
-        while is_bounded and self._best_of_start < _MIN_IMPROVEMENT * before:
+        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_FOR_REPEAT * before:
             before = self._best_of_start
             x = self._run_slsqp(x, *_SLSQP_STAGES[-1])
 
@@ -279,7 +279,7 @@ class _DescentSearch:
             constraints={
                 "type": "ineq",
                 "fun": lambda x, *sharpness: (
-                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).uses
+                    USABLE_LIMIT_SHARE - self._evaluate_once(x, *sharpness).smooth_limit_uses
                 ),
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (criterion_sharpness, limit_sharpness),
@@ -292,7 +292,7 @@ class _DescentSearch:
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
-        excess = np.maximum(point.uses - USABLE_LIMIT_SHARE, 0)
+        excess = np.maximum(point.smooth_limit_uses - USABLE_LIMIT_SHARE, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
@@ -304,7 +304,7 @@ class _DescentSearch:
             self._count_evaluation()
             self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
-            if self._last.largest_limit_use <= _MAX_FEASIBLE_USE:
+            if self._last.largest_limit_use <= _MAX_LIMIT_USE_OF_FEASIBLE_MOTION:
                 self._record_iterate(x)
             elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
                 "inf"

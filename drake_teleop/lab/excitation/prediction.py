@@ -50,7 +50,10 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = fusion_gains(estimation, sensor, num_joints, period)
-        filters = _motion_error_filter(linear, period), _motion_error_filter(angular, period)
+        filters = (
+            _motion_error_polynomials(linear, period),
+            _motion_error_polynomials(angular, period),
+        )
     place = sensor.accelerometer_pose()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -76,29 +79,31 @@ def predicted_covariance(
     if noise.motion_error_filters is not None:
         of_s, of_alpha = noise.motion_error_filters
         of_motion = -spatial_inertia_matrix(phi) @ influence[:, :6]
-        through_s = _filter_backwards(of_s, of_motion[:, :3], step)
+        through_s = _filter_backwards_in_time(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.p_SoAo_S).T @ through_s
         influence[:, 6:9] = through_s
-        influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
+        influence[:, 9:] = _filter_backwards_in_time(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
-    of_white = _covariance_of_influence(influence, noise.white_noise_densities) / step
-    return of_white + _covariance_of_influence(later, noise.random_walk_variances) * step
+    of_white = _covariance_from_noise_influence(influence, noise.white_noise_densities) / step
+    return of_white + _covariance_from_noise_influence(later, noise.random_walk_variances) * step
 
 
-def _covariance_of_influence(influence: Array, variances: Array) -> Array:
+def _covariance_from_noise_influence(influence: Array, variances: Array) -> Array:
     rows = (influence * np.sqrt(variances)[:, np.newaxis]).reshape(-1, influence.shape[2])
     return rows.T @ rows
 
 
-def _motion_error_filter(gains: Array, period: float) -> tuple[Array, Array]:
+def _motion_error_polynomials(gains: Array, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
 
 
-def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
+def _filter_backwards_in_time(
+    polynomials: tuple[Array, Array], signals: Array, step: float
+) -> Array:
     # Imported late: slower than the station's import.
     from scipy.signal import bilinear, lfilter
 

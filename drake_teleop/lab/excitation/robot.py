@@ -15,7 +15,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.collision import CLEARANCE_M, CollisionScene
+from drake_teleop.lab.excitation.collision import MIN_CLEARANCE_M, CollisionScene
 from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
@@ -34,20 +34,20 @@ from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_NUM_RANDOM_POSTURES = 1000  # random postures for distances of shapes
+_NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
 # Usable share of joint limits; the rest is for tracking errors and feedback.
-_JOINT_LIMIT_SHARE = 0.8
+_USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
-_FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
+_USABLE_SENSOR_FORCE_SHARE, _USABLE_SENSOR_TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_HEAVIEST_LOAD_RATIO = 1.3
+_HEAVIEST_OVER_MODELLED_LOAD = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
-_PAYLOAD_COM_M, _PAYLOAD_GYRATION_M = 0.08, 0.05
+_ASSUMED_PAYLOAD_COM_ALONG_Z_S_M, _ASSUMED_PAYLOAD_GYRATION_RADIUS_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
 _MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
-_WORKSPACE_POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
+_TOOL_POINTS_IN_WORKSPACE_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
 _WORKSPACE_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
 _UNLIMITED_BOX = np.zeros(3), np.full(3, np.inf)
 
@@ -59,7 +59,7 @@ class Robot:
     Attributes:
         plant: Drake's plant, with the heaviest load.
         sensor_frame: frame S of the wrist sensor.
-        home: (n,) start posture of the search [rad].
+        home_posture: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
     """
 
@@ -70,9 +70,9 @@ class Robot:
     sensor_frame: Frame
     arm: ArmModel
     limits: Limits
-    scales: CriterionScales
-    noise: SensorNoise
-    home: Array
+    criterion_scales: CriterionScales
+    sensor_noise: SensorNoise
+    home_posture: Array
     assumptions: tuple[str, ...]
     temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
@@ -91,7 +91,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
     own = scenario.slave.model != ""
     scene = CollisionScene(
-        parse, (_HEAVIEST_LOAD_RATIO - 1) * slave.arm.phi_load, visuals_count=not own
+        parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_count=not own
     )
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
@@ -102,7 +102,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
         start=slave.start,
-        points_S=np.array([np.zeros(3), slave.tip] if own else _WORKSPACE_POINTS_S),
+        points_S=np.array([np.zeros(3), slave.tip] if own else _TOOL_POINTS_IN_WORKSPACE_S),
         box=_UNLIMITED_BOX if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
         folders=folders,
@@ -142,7 +142,7 @@ def RobotFromModel(
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_HEAVIEST_LOAD_RATIO - 1) * load
+        reserve = (_HEAVIEST_OVER_MODELLED_LOAD - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -159,8 +159,8 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the total mass beyond the sensor, or remove the option",
             )
-        missing_mass, com = mass - load[0], np.array([0.0, 0.0, _PAYLOAD_COM_M])
-        inertia = missing_mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3
+        missing_mass, com = mass - load[0], np.array([0.0, 0.0, _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M])
+        inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
         scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
@@ -197,7 +197,7 @@ def _make_robot(
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
-    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_RANDOM_POSTURES, len(half)))
+    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES_FOR_SHAPE_DISTANCES, len(half)))
     postures = middle + finite_half_ranges(half) * random
     candidates, touching = scene.find_collision_candidates(postures, start)
     if touching:
@@ -206,15 +206,15 @@ def _make_robot(
         )
     rows, ends, radii, pairs, distances = scene.bounding_capsules(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
-    force = _FORCE_SHARE * min(sensor.force_range)
-    torque = _TORQUE_SHARE * min(sensor.torque_range)
+    force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)
+    torque = _USABLE_SENSOR_TORQUE_SHARE * min(sensor.torque_range)
     alpha = sensor.angular_acceleration_range
     limits = Limits(
         q_middle=middle,
-        q_half=_JOINT_LIMIT_SHARE * half,
-        velocity=_JOINT_LIMIT_SHARE * arm.velocity_limit,
+        q_half=_USABLE_JOINT_LIMIT_SHARE * half,
+        velocity=_USABLE_JOINT_LIMIT_SHARE * arm.velocity_limit,
         acceleration=arm.acceleration_limit,
-        max_torques=_JOINT_LIMIT_SHARE * arm.effort_limit,
+        max_torques=_USABLE_JOINT_LIMIT_SHARE * arm.effort_limit,
         heaviest_phi=phi,
         max_sensor_norms=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
@@ -225,7 +225,7 @@ def _make_robot(
         capsule_radius=radii,
         capsule_pairs=pairs,
         min_pair_distances=distances,
-        clearance=CLEARANCE_M,
+        clearance=MIN_CLEARANCE_M,
     )
     return Robot(
         name=name,
@@ -235,9 +235,11 @@ def _make_robot(
         sensor_frame=scene.sensor_frame,
         arm=arm,
         limits=limits,
-        scales=CriterionScales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
-        noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
-        home=middle if start is None else start,
+        criterion_scales=CriterionScales(
+            (float(std[0]), float(std[3])), characteristic_length(phi), phi
+        ),
+        sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
+        home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),
         temporary_folders=tuple(folders),
     )

@@ -61,21 +61,21 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
 _MAX_LOG_PERIOD_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
-_MAX_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _PROGRESS_RATIO = 20, 1, 0.99
+_MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
 # Additional margin after a round that missed the tolerance.
-_FACTOR_MARGIN_AFTER_MISS = 1.005
+_TOLERANCE_FACTOR_MARGIN_AFTER_MISS = 1.005
 # Number of rounds without any motion before the search fails.
 _MAX_ROUNDS_WITHOUT_MOTION = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.
-_MAX_MISFIT_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
+_MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 # Difference between the seeds of rounds.
-_SEED_STEP = 2**33
+_SEED_STEP_BETWEEN_ROUNDS = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
-_COEFFICIENT_SPREAD, _PERIOD_SPREAD = 0.2, 1.3
+_MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
 # Sharpness of the maximum over tolerances, relative to that over eigenvalues.
-_SHARPNESS_RATIO = 4.0
+_TOLERANCE_SHARPNESS_RATIO = 4.0
 # Regularisation of the balanced information; it is singular without motion.
-_REGULARISATION = 1e-11
+_INFORMATION_REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,16 +105,21 @@ def design_shortest_motion(
     )
     factor = np.ones(len(errors))
     task = DesignTask(
-        robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
+        robot.arm.table,
+        robot.limits,
+        Criterion("A16", robot.criterion_scales),
+        robot.home_posture,
+        1.0,
+        harmonics,
     )
     worst, around = np.inf, None
     best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
-    for k in range(_MAX_ROUNDS):
+    for k in range(_MAX_DESIGN_ROUNDS):
         problem = ShortestMotionProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_VARIED_STARTS)
         found = minimise_criterion(
-            problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
+            problem, seed=seed + _SEED_STEP_BETWEEN_ROUNDS * k, starts=num_starts, progress=progress
         )
         found = [each for each in found if each.criterion_value <= _MAX_PERIOD_S]
         if not found:
@@ -125,15 +130,17 @@ def design_shortest_motion(
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(
-            *motion, 1 / CHECK_RATE_HZ, robot.noise, robot.limits.heaviest_phi
+            *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
         )
         reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _MAX_MISFIT_OF_VARIED_MOTION else None
+        around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
             vain_rounds = (
-                0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
+                0
+                if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
+                else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
@@ -144,7 +151,7 @@ def design_shortest_motion(
         new_factor = factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         factor = (
-            _FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
+            _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
             if worst > 1.0 and k > 0
             else new_factor
         )
@@ -180,8 +187,8 @@ class ShortestMotionProblem(DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = relative_white_noise_densities(robot.noise, robot.limits.heaviest_phi)
-        self._roots = np.sqrt(robot.noise.white_noise_densities[:6])
+        self._noise = relative_white_noise_densities(robot.sensor_noise, robot.limits.heaviest_phi)
+        self._roots = np.sqrt(robot.sensor_noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
         self._period, self._shortest = 1.0, task.num_harmonics / _MAX_FREQUENCY_HZ
@@ -192,9 +199,9 @@ class ShortestMotionProblem(DesignProblem):
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return the unknowns of a random motion; `near_home`: of one near the known motion."""
         if self._around is not None and near_home:
-            other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
+            other = _MAX_COEFFICIENT_VARIATION * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
-            x[-1] += np.log(_PERIOD_SPREAD) * rng.uniform(-1.0, 1.0)
+            x[-1] += np.log(_MAX_PERIOD_VARIATION_FACTOR) * rng.uniform(-1.0, 1.0)
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
@@ -225,7 +232,9 @@ class ShortestMotionProblem(DesignProblem):
         write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
+        use, worst, g_V = self._largest_error_over_tolerance(
+            _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
+        )
         criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
@@ -259,14 +268,14 @@ class ShortestMotionProblem(DesignProblem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(self._variances(self._weighted_regressor_rows(*motion), period)[0])
+        return np.sqrt(self._estimate_variances(self._weighted_regressor_rows(*motion), period)[0])
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
-    def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
+    def _estimate_variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         # Variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k, u_k = G^-1 B v_k: G is the information of
         # weighted least squares; B contains the noise densities; e_k is a row of `errors`
         # (sandwich, White, Econometrica 1980).
@@ -274,15 +283,15 @@ class ShortestMotionProblem(DesignProblem):
         G = share * (flat.T @ flat)
         B = share * (flat.T @ (self._noise @ rows).reshape(flat.shape))
         size = 1.0 / np.sqrt(np.diag(G))
-        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULARISATION * np.eye(16))
+        inverse = np.linalg.inv(G * np.outer(size, size) + _INFORMATION_REGULARISATION * np.eye(16))
         inverse *= np.outer(size, size)
         v = self._errors @ inverse
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
+    def _largest_error_over_tolerance(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
-        variances, v, u = self._variances(rows, self._period)
+        variances, v, u = self._estimate_variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
         smooth = float(logs.max() + np.log(weights.sum()) / sharpness)

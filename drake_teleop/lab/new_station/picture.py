@@ -25,17 +25,17 @@ _BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0)
 _WALL_THICKNESS_M = 0.1
 _LIGHT_DIRECTION = np.array([0.35, -0.5, 0.8])
 _VIEW_ANGLES_DEG = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth from the tool
-_WALL_DIVISIONS = 8  # divisions of the wall in the picture
-_TRIAD_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
+_NUM_WALL_DIVISIONS = 8  # divisions of the wall in the picture
+_SENSOR_AXES_LENGTH_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
-_SPIRAL_INDICES = np.arange(0.5, 250.0)
-_SPIRAL_RADII = np.sqrt(1.0 - (1.0 - _SPIRAL_INDICES / 125.0) ** 2)
-_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _SPIRAL_INDICES
+_HULL_SPIRAL_INDICES = np.arange(0.5, 250.0)
+_HULL_SPIRAL_RADII = np.sqrt(1.0 - (1.0 - _HULL_SPIRAL_INDICES / 125.0) ** 2)
+_HULL_SPIRAL_ANGLES_RAD = np.pi * (1.0 + 5.0**0.5) * _HULL_SPIRAL_INDICES
 _HULL_SAMPLE_DIRECTIONS = np.column_stack(
     [
-        _SPIRAL_RADII * np.cos(_SPIRAL_ANGLES_RAD),
-        _SPIRAL_RADII * np.sin(_SPIRAL_ANGLES_RAD),
-        1.0 - _SPIRAL_INDICES / 125.0,
+        _HULL_SPIRAL_RADII * np.cos(_HULL_SPIRAL_ANGLES_RAD),
+        _HULL_SPIRAL_RADII * np.sin(_HULL_SPIRAL_ANGLES_RAD),
+        1.0 - _HULL_SPIRAL_INDICES / 125.0,
     ]
 )
 
@@ -65,7 +65,7 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
             axes.add_collection3d(collection)
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
             _draw_plane(axes, lower, upper, plan.base_plane_height)
-            _draw_triad(axes, shapes, _TRIAD_LENGTH_SHARE * float(max(upper - lower)))
+            _draw_triad(axes, shapes, _SENSOR_AXES_LENGTH_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.base_plane_height)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
@@ -116,7 +116,7 @@ def _hull_triangles(points: Array) -> Array:
 def _box_triangles(top: Array, size: Array) -> Array:
     # Small triangles are better sorted by depth than large ones.
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    counts = [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]
+    counts = [_NUM_WALL_DIVISIONS, _NUM_WALL_DIVISIONS, 2]
     cells = np.array(list(product(*map(range, counts)))) / counts
     pieces = [_hull_triangles(cell + corners / counts) for cell in cells]
     unit = np.concatenate(pieces)

@@ -21,7 +21,7 @@ from pydrake.multibody.tree import BodyIndex, SpatialInertia
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.random_postures import (
-    NUM_POSTURES,
+    NUM_RANDOM_POSTURES,
     Postures,
     StartRegion,
     degrees_of_freedom,
@@ -56,21 +56,21 @@ TOOL_AXES = {
     "-y": RotationMatrix.MakeXRotation(np.pi / 2),
     "-z": RotationMatrix.MakeXRotation(np.pi),
 }
-_CUBE_HALVES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
+_CUBE_HALF_EDGES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
 # Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
 # postures whose shapes are checked if all solved ones overlap.
-_NUM_CANDIDATES, _NUM_FINALISTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
-_SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
+_NUM_SOLVED_POSTURES, _NUM_BEST_STARTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
+_MAX_SCORE_LOSS = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
-_MAX_POSITION_ERROR_RATIO = 0.1  # error of an arm with few joints, over displacement
+_MAX_ERROR_OVER_DISPLACEMENT = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
-_MIN_JOINT_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
-MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
-_SUFFICIENT_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_JOINT_DISPLACEMENT = 2.0  # largest joint displacement to a corner of the cube [rad, m]
-_SUFFICIENT_CUBE_HALF_M = 0.15  # sufficient half edge of the cube [m]
-_SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
+_MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
+MIN_HELD_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
+_SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
+_MAX_JOINT_MOVE_TO_CORNER = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
+_MAX_HEIGHT_ABOVE_LOWEST_M = 1e-4  # lowest points within this height share the contact [m]
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
 _MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
@@ -130,7 +130,7 @@ class TrialWalls(Environment):
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add one floating body for each wall."""
         for edge in WALL_EDGES_M:
-            name = _wall_name(edge)
+            name = _trial_wall_name(edge)
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
             AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
@@ -140,7 +140,7 @@ class TrialWalls(Environment):
             )
 
 
-def _wall_name(edge: float) -> str:
+def _trial_wall_name(edge: float) -> str:
     return f"wall of {edge:g} m"
 
 
@@ -164,27 +164,27 @@ def find_start_place(
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[StartPlace]()
-    for rows in _rows_to_solve(pointed, postures, region, shapes):
-        solved = _solve_candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
+    for rows in _order_postures_to_solve(pointed, postures, region, shapes):
+        solved = _solve_candidates(pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, is_free)
         found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.has_overlaps for place in found):
             break
     found.sort(key=lambda place: place.posture_score, reverse=True)
     good = [
-        place for place in found if place.posture_score > found[0].posture_score - _SCORE_TOLERANCE
+        place for place in found if place.posture_score > found[0].posture_score - _MAX_SCORE_LOSS
     ]
     best = None
-    for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
+    for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
         if best is None or best.cube_half_m == 0.0:
             cubes = [
                 _with_reachable_cube(pointed, place, is_free, vertical)
                 for place in places[:_MAX_TESTED_CUBES]
             ]
-            best = max(cubes, key=_place_merit, default=None)
+            best = max(cubes, key=_merit_of_start_place, default=None)
     if best is None or best.cube_half_m == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
-            f" ({_describe_removals(region, len(postures.q))})",
+            f" ({_describe_removed_postures(region, len(postures.q))})",
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )
@@ -192,30 +192,30 @@ def find_start_place(
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
-def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+def _find_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
-    roomy = joint_margins(arm, q) > _MIN_JOINT_MARGIN
-    for share in (1.0, MIN_LOAD_SHARE):
+    roomy = joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
+    for share in (1.0, MIN_HELD_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
-        strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
+        strong = (np.abs(torques) < MAX_HOLDING_TORQUE_USE * arm.effort_limit).all(axis=1)
         if (roomy & strong).any():
             return np.flatnonzero(roomy & strong)
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
-def _describe_removals(region: StartRegion, left: int) -> str:
+def _describe_removed_postures(region: StartRegion, left: int) -> str:
     causes = ", ".join(f"in {count} {name}" for name, count in region.removed_counts if count)
-    return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
+    return f"of {NUM_RANDOM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
-def _rows_to_solve(
+def _order_postures_to_solve(
     arm: ArmModel, postures: Postures, region: StartRegion, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
-    usable = order[np.isin(order, _usable_rows(arm, postures.q))]
+    usable = order[np.isin(order, _find_holdable_postures(arm, postures.q))]
     yield usable
     if shapes is None:
         return
@@ -237,11 +237,11 @@ def _solve_candidates(
         solved = [
             start
             for q, position in zip(postures.q, postures.p_WS, strict=True)
-            for start in _exact_starts(arm, q, position)
+            for start in _starts_at_rounded_position(arm, q, position)
         ]
     if not solved:
         return
-    solved = [solved[k] for k in _usable_rows(arm, np.array([q for q, _, _ in solved]))]
+    solved = [solved[k] for k in _find_holdable_postures(arm, np.array([q for q, _, _ in solved]))]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = posture_scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
@@ -254,7 +254,9 @@ def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
     return pose
 
 
-def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Array, Array, bool]]:
+def _starts_at_rounded_position(
+    arm: ArmModel, q: Array, position: Array
+) -> Iterator[tuple[Array, Array, bool]]:
     """Yield joint positions near q, their pose, and whether `slave.position` specifies them."""
     position = np.round(position, 2)
     for yaw_deg in _TOOL_YAWS_DEG:
@@ -311,7 +313,7 @@ def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
         [x, y, z + (_SPACE_ABOVE_TOOL_POINT_M - _SPACE_BELOW_TOOL_POINT_M) / 2.0]
     )
     for edge in WALL_EDGES_M:
-        body = plant.GetBodyByName(_wall_name(edge))
+        body = plant.GetBodyByName(_trial_wall_name(edge))
         plant.SetFreeBodyPose(shapes.context, body, middle)
         walls[body.index()] = edge
     return walls
@@ -323,7 +325,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
-    lowest = points[points[:, 2] < points[:, 2].min() + _SAME_HEIGHT_M]
+    lowest = points[points[:, 2] < points[:, 2].min() + _MAX_HEIGHT_ABOVE_LOWEST_M]
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
@@ -333,10 +335,10 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
 
-def _place_merit(place: StartPlace) -> tuple[float, float, bool, float]:
+def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]:
     enough_room, enough_space = (
-        min(place.joint_margin, _SUFFICIENT_JOINT_MARGIN),
-        min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_M),
+        min(place.joint_margin, _SUFFICIENT_START_JOINT_MARGIN),
+        min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_EDGE_M),
     )
     return enough_room, enough_space, place.is_set_by_position, place.cube_half_m
 
@@ -350,35 +352,35 @@ def _with_reachable_cube(
     if vertical:
         signs = signs[[2, 5]]
     largest = 0.0
-    for half in _CUBE_HALVES_M:
-        if not all(_can_reach(arm, place, half * each, is_free) for each in signs):
+    for half in _CUBE_HALF_EDGES_M:
+        if not all(_can_reach_corner(arm, place, half * each, is_free) for each in signs):
             break
         largest = half
     room = place.joint_margin if largest else 0.0
     return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
-def _can_reach(arm: ArmModel, place: StartPlace, displacement: Array, is_free: bool) -> bool:
+def _can_reach_corner(arm: ArmModel, place: StartPlace, displacement: Array, is_free: bool) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
     if is_free:
-        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_DISPLACEMENT)
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_MOVE_TO_CORNER)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
-    return bool(error < _MAX_POSITION_ERROR_RATIO * np.linalg.norm(displacement))
+    return bool(error < _MAX_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
 
 
-_MIN_AXIS_COSINE = 0.75  # smallest cosine of the angle between tool and axis
+_MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
 #: Opposite of each axis.
 OPPOSITE_AXIS = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
 _ROUNDING_TOLERANCE_M = 1e-9
-_MIN_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
+_MIN_DIRECTED_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 
 
 def nearest_axis(direction: Array) -> str:
     """Return the axis of S nearest to a direction (3,) in S; empty if none is near."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
-    if size < _MIN_COM_OFFSET_M or abs(direction[k]) < _MIN_AXIS_COSINE * size:
+    if size < _MIN_DIRECTED_COM_OFFSET_M or abs(direction[k]) < _MIN_COSINE_TOOL_TO_AXIS * size:
         return ""
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 

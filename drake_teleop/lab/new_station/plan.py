@@ -10,8 +10,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
-    MAX_TORQUE_USE,
-    MIN_LOAD_SHARE,
+    MAX_HOLDING_TORQUE_USE,
+    MIN_HELD_LOAD_SHARE,
     OPPOSITE_AXIS,
     TOOL_AXES,
     StartPlace,
@@ -37,17 +37,17 @@ _PHANTOM_WORKSPACE_HALF_EDGE_M = 0.08
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
-_STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_RADIUS_M = 0.05, 0.1, 0.012
+_STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_BALL_RADIUS_M = 0.05, 0.1, 0.012
 _STAND_IN_FREE_LENGTH_M = 0.05
-_STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
-_SUFFICIENT_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
-_MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
+_STAND_IN_TOOL_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
+_SUFFICIENT_POSTURE_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
+_MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
 WALL_STIFFNESS_N_M, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
-SWING_HZ, _MAX_SPEED_USE = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
+SWING_HZ, _MAX_JOINT_SPEED_USE = 1.0, 0.5  # Hz; largest share of the joint speed limits
 
 
 @dataclass(frozen=True)
@@ -102,16 +102,16 @@ def plan_station(
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
     shapes = PostureShapes(slave, TrialWalls(), sticks=True)
-    load = shapes.arm.phi_load[:4] - (_STAND_IN_LOAD if tool is None else 0.0)
+    load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
     axis, own_tool = _tool_axis(shapes, load), False
-    if tool is None and _reaches_beyond_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
+    if tool is None and _tool_extends_beyond_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
-    share = 1.0 if own_tool else MIN_LOAD_SHARE if tool is None else 0.0
-    model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
+    share = 1.0 if own_tool else MIN_HELD_LOAD_SHARE if tool is None else 0.0
+    model, weak_joints, assumed = _without_weak_torque_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _largest_mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
@@ -126,8 +126,8 @@ def plan_station(
     )
     shapes.move_to(place.q)
     lowest = lowest_tool_point(shapes)
-    swing = min(_MAX_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
-    swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
+    swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
+    swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
     return StationPlan(
         joint_names=tuple(model.joint_names),
         stand_in_tool=on_sensor,
@@ -137,7 +137,7 @@ def plan_station(
         translation_scale=translation_scale,
         force_scale=_floor_two_digits(force_scale),
         swing_amplitude_m=_floor_two_digits(
-            swing * min(1.0, _MAX_SPEED_USE / _swing_speed_use(model, place, swing))
+            swing * min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
         ),
         lowest_tool_point_W=lowest,
         tip_S=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
@@ -170,7 +170,7 @@ def _find_start_and_tool_axis(
             )
         except DrakeTeleopError as error:
             errors.append(error)
-        if found and found[-1][0].posture_score > _SUFFICIENT_SCORE:
+        if found and found[-1][0].posture_score > _SUFFICIENT_POSTURE_SCORE:
             break
     if not found:
         raise errors[0]
@@ -187,7 +187,7 @@ def _tool_axis(shapes: PostureShapes, load: Array) -> str:
     return last_joint_axis(shapes.arm) or "z"
 
 
-def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
+def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_end = extent_beyond_sensor(
         shapes, shapes.bodies_welded_to_sensor() - shapes.tool_bodies, axis
@@ -206,7 +206,7 @@ def base_plane(shapes: PostureShapes) -> float:
 
 def _stand_in_tool(axis: str, length: float) -> Tool:
     along = TOOL_AXES[axis].matrix()[:, 2]
-    ball = Ball(_STAND_IN_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
+    ball = Ball(_STAND_IN_BALL_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
     return Tool(
         mass=_STAND_IN_MASSES_KG[0], com=(_STAND_IN_COM_M * along).round(6).tolist(), shapes=[ball]
     )
@@ -217,7 +217,7 @@ def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
     return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
 
 
-def _without_weak_limits(
+def _without_weak_torque_limits(
     arm: ArmModel, q: Array, share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
     """Return the arm without torque limits too low to hold it at q, their joints, and texts.
@@ -226,7 +226,7 @@ def _without_weak_limits(
         share: share of the load that the arm must hold.
     """
     torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
-    weak = torque > MAX_TORQUE_USE * arm.effort_limit
+    weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit
     names = tuple(np.array(arm.joint_names)[weak].tolist())
     texts = [
         f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
@@ -239,7 +239,7 @@ def _largest_mass_to_hold(arm: ArmModel, q: Array) -> float:
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
-        if np.abs(torque / arm.effort_limit).max() < MAX_TORQUE_USE:
+        if np.abs(torque / arm.effort_limit).max() < MAX_HOLDING_TORQUE_USE:
             break
     return mass
 

@@ -18,11 +18,11 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
 from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 
-NUM_POSTURES = 20_000
-_MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
+NUM_RANDOM_POSTURES = 20_000
+_MIN_COS_TOOL_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
 # Distance of S from the vertical line through the first joint, and its height above that joint, in
 # units of the reach.
-_RADIUS_RANGE_OVER_REACH, _HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
+_SENSOR_RADIUS_RANGE_OVER_REACH, _SENSOR_HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
 (
     _PREFERRED_RADIUS_OVER_REACH,
@@ -32,10 +32,10 @@ _RADIUS_RANGE_OVER_REACH, _HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
 _MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
-_SIDE_HALF_WIDTH_RAD, _NUM_SIDES, _FRONT_SIDE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
-_MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
-_ROUNDING_TOLERANCE = 1e-9  # singular values that are 0, over the largest
-_NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
+_HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
+_MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
+_MAX_RATIO_OF_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
+_MAX_NEUTRAL_ELBOW_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
 _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
@@ -72,7 +72,7 @@ class StartRegion:
         first_joint_W: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
         is_joint_above_plane: (n,) True for joints above the base plane, not of a mobile base.
-        side_rad: direction of the region about z_W, from x_W [rad].
+        side_direction_rad: direction of the region about z_W, from x_W [rad].
         removed_counts: number of postures that each condition removed.
     """
 
@@ -81,7 +81,7 @@ class StartRegion:
     first_joint_W: Array
     reach: float
     is_joint_above_plane: NDArray[np.bool_]
-    side_rad: float = 0.0
+    side_direction_rad: float = 0.0
     removed_counts: tuple[tuple[str, int], ...] = ()
 
     @property
@@ -92,7 +92,7 @@ class StartRegion:
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,
             float(self.first_joint_W[2]) + _MIN_PREFERRED_HEIGHT_OVER_REACH * self.reach,
         )
-        direction = np.array([np.cos(self.side_rad), np.sin(self.side_rad)])
+        direction = np.array([np.cos(self.side_direction_rad), np.sin(self.side_direction_rad)])
         return np.array([*(self.first_joint_W[:2] + r * direction), height])
 
 
@@ -115,10 +115,10 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
 
 
 def random_postures(arm: ArmModel) -> Postures:
-    """Return `NUM_POSTURES` random postures."""
+    """Return `NUM_RANDOM_POSTURES` random postures."""
     lower, upper = joint_sampling_range(arm)
     random = np.random.default_rng(0)
-    return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
+    return postures_at(arm, random.uniform(lower, upper, (NUM_RANDOM_POSTURES, arm.num_joints)))
 
 
 def select_suitable_postures(
@@ -134,15 +134,18 @@ def select_suitable_postures(
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
     reach = float(np.quantile(radius, 0.98))
     tool_height = postures.p_WS[:, 2] - plane - tool_length
-    lowest_origin = plane + _MIN_ORIGIN_HEIGHT_M
+    lowest_origin = plane + _MIN_JOINT_ORIGIN_HEIGHT_M
     raised = postures.origins[:, :, 2].max(axis=0) > lowest_origin
     raised[0] = False
     conditions: tuple[tuple[str, Any], ...] = (
-        ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
+        (
+            "z_S is more than 40 degrees from downwards",
+            postures.R_WS[:, 2, 2] < -_MIN_COS_TOOL_TILT,
+        ),
         (
             "S is too near to the first joint, too far, too low or too high",
-            _is_within(radius / reach, _RADIUS_RANGE_OVER_REACH)
-            & _is_within(from_first[:, 2] / reach, _HEIGHT_RANGE_OVER_REACH)
+            _is_within_limits(radius / reach, _SENSOR_RADIUS_RANGE_OVER_REACH)
+            & _is_within_limits(from_first[:, 2] / reach, _SENSOR_HEIGHT_RANGE_OVER_REACH)
             & (tool_height > _MIN_TOOL_HEIGHT_M)
             & (np.abs(postures.p_WS) < _MAX_SENSOR_COORDINATE_M).all(axis=1),
         ),
@@ -156,21 +159,21 @@ def select_suitable_postures(
         removed.append((name, int((~met[rows]).sum())))
         rows = rows[met[rows]]
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
-    sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
-    counts = np.array([float(_is_on_side(angle, side).sum()) for side in sides])
-    counts[0] *= _FRONT_SIDE_COUNT_FACTOR
+    sides = 2.0 * np.pi * np.arange(_NUM_EXAMINED_SIDES) / _NUM_EXAMINED_SIDES
+    counts = np.array([float(_is_angle_on_side(angle, side).sum()) for side in sides])
+    counts[0] *= _FRONT_POSTURE_COUNT_FACTOR
     side = float(sides[int(np.argmax(counts))])
     region = StartRegion(plane, tool_length, first, reach, raised, side, tuple(removed))
-    return postures[rows[_is_on_side(angle, side)]], region
+    return postures[rows[_is_angle_on_side(angle, side)]], region
 
 
-def _is_within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+def _is_within_limits(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (values > limits[0]) & (values < limits[1])
     return inside
 
 
-def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_HALF_WIDTH_RAD)
+def _is_angle_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
+    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_HALF_ANGLE_OF_SIDE_RAD)
     return near
 
 
@@ -182,14 +185,14 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
     # Only as many singular values as the arm has degrees of freedom.
-    smallest = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    smallest = _jacobian_singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
     elbow = (
         np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
         / _SUFFICIENT_ELBOW_UP_SHARE
     )
     origins = postures.origins[:, region.is_joint_above_plane, 2]
-    low = np.maximum(region.plane_height + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
+    low = np.maximum(region.plane_height + _MIN_JOINT_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred_position, axis=1) / region.reach
     total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
     return total
@@ -204,7 +207,7 @@ def joint_margins(arm: ArmModel, q: Array) -> Array:
     return margins
 
 
-def _singular_values(arm: ArmModel, postures: Postures) -> Array:
+def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
     # Rotations are multiplied by `orientation_length` [m].
     slides = (arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
@@ -217,8 +220,8 @@ def _singular_values(arm: ArmModel, postures: Postures) -> Array:
 def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
-    values = _singular_values(arm, few)
-    return int((values > _ROUNDING_TOLERANCE * values[:, :1]).sum(axis=1).max())
+    values = _jacobian_singular_values(arm, few)
+    return int((values > _MAX_RATIO_OF_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
 
 
 def elbow_up_share(postures: Postures, reach: float) -> Array:
@@ -236,7 +239,7 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
     farthest = sizes.argmax(axis=1)
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
-    return np.where(size > _NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
+    return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET * reach, up, 1.0)
 
 
 def rotate_sensor_frame_of_arm(arm: ArmModel, R_SA: Array) -> ArmModel:

@@ -11,7 +11,7 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import Rates
 
-_MAX_PRESS_DEPTH_M = 0.01  # largest depth in the wall
+_MAX_PRESS_DEPTH_INTO_WALL_M = 0.01  # largest depth in the wall
 
 
 def scenario_text(
@@ -24,7 +24,7 @@ def scenario_text(
         sensor: preset of the wrist sensor, or None.
     """
     s, swing = plan.translation_scale, plan.swing_amplitude_m
-    down = 1.5 * swing + min(_MAX_PRESS_DEPTH_M, swing / 4.0)
+    down = 1.5 * swing + min(_MAX_PRESS_DEPTH_INTO_WALL_M, swing / 4.0)
     if plan.place.is_set_by_position:
         slave["position"] = round_to_four_digits(plan.place.position)
     else:

@@ -28,7 +28,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_OVER_FREE_PEAK = 1.5
+_CONTACT_THRESHOLD_OVER_FREE_PEAK = 1.5
 _ALL_AXES_MOTION = Sine(
     duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
 )
@@ -107,7 +107,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
         measured_wrench_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_wrench_free=calculated_free,
         in_contact=is_in_contact(touched),
-        threshold_N=_THRESHOLD_OVER_FREE_PEAK * float(_force_norm(calculated_free).max()),
+        threshold_N=_CONTACT_THRESHOLD_OVER_FREE_PEAK * float(_force_norms(calculated_free).max()),
     )
 
 
@@ -176,13 +176,13 @@ def free_values(run: FreeMotion, component: int, unit: str) -> NamedValues:
 
 
 def contact_values(run: ContactMotion) -> NamedValues:
-    t, force_norm = run.contact_result.t, _force_norm(run.calculated_wrench)
+    t, force_norm = run.contact_result.t, _force_norms(run.calculated_wrench)
     detected = force_norm > run.threshold_N
     window = _contact_window(run)
     after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
     return {
-        "true_s": _first_time(t, run.in_contact),
-        "detected_s": _first_time(t, detected),
+        "true_s": _time_of_first_true(t, run.in_contact),
+        "detected_s": _time_of_first_true(t, detected),
         "threshold_N": run.threshold_N,
         "raw_detectable": bool(raw_force_beyond_free_range(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
@@ -191,7 +191,7 @@ def contact_values(run: ContactMotion) -> NamedValues:
         "peak_inertial_N": _largest_norm((run.measured_wrench - run.calculated_wrench)[:, :3]),
         "duration_s": float(np.count_nonzero(run.in_contact) * (t[1] - t[0])),
         "largest_deflection_mm": 1e3 * float(np.abs(run.contact_result["sheet_state"][:, 0]).max()),
-        "free_residual_norm_max_N": float(_force_norm(run.calculated_wrench_free).max()),
+        "free_residual_norm_max_N": float(_force_norms(run.calculated_wrench_free).max()),
         "free_residual_norm_max_Nm": _largest_norm(run.calculated_wrench_free[:, 3:]),
     }
 
@@ -199,7 +199,7 @@ def contact_values(run: ContactMotion) -> NamedValues:
 def raw_force_beyond_free_range(run: ContactMotion) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
-        np.column_stack([raw[:, :3], _force_norm(raw)])
+        np.column_stack([raw[:, :3], _force_norms(raw)])
         for raw in (run.measured_wrench[_contact_window(run)], run.measured_wrench_free)
     )
     if not len(touched):
@@ -263,7 +263,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
 
 def time_of_free_reversal(run: ContactMotion) -> float | None:
     """Return the time of the largest raw force after contact [s], or None."""
-    t, force_norm = run.contact_result.t, _force_norm(run.measured_wrench)
+    t, force_norm = run.contact_result.t, _force_norms(run.measured_wrench)
     window = _contact_window(run)
     if not window.any():
         return None
@@ -271,7 +271,7 @@ def time_of_free_reversal(run: ContactMotion) -> float | None:
     return float(t[np.argmax(force_norm)])
 
 
-def _force_norm(wrench: Array) -> Array:
+def _force_norms(wrench: Array) -> Array:
     return np.linalg.norm(wrench[:, :3], axis=1)
 
 
@@ -283,5 +283,5 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _first_time(t: Array, happened: NDArray[np.bool_]) -> float | None:
+def _time_of_first_true(t: Array, happened: NDArray[np.bool_]) -> float | None:
     return float(t[np.argmax(happened)]) if happened.any() else None

@@ -43,15 +43,15 @@ def scaling_figure(
             axes.plot(time, trace, color=BLUE if sigma else GREEN)
             axes.set_title(_sigma_title(sigma))
             peak = float(np.abs(trace).max())
-            _write_note(
+            _write_note_above_axes(
                 axes,
                 f"peak {_format_number(peak)} {unit}"
                 f"   ·   {_format_number(peak / downscaling)} {unit}"
                 " at the master",
             )
             axes.set_ylabel(f"{symbol} [{unit}]")
-            _add_master_axis(axes, downscaling, f"at the master [{unit}]")
-        rows[0].set_ylim(*_common_range(traces))
+            _add_axis_at_master_scale(axes, downscaling, f"at the master [{unit}]")
+        rows[0].set_ylim(*_common_value_range(traces))
         rows[0].set_xlim(time[0], time[-1])
         rows[-1].set_xlabel(f"t [{time_unit}]")
     return figure
@@ -86,19 +86,19 @@ def contact_figure(
             axes.set_title(title)
             axes.set_ylabel(f"{symbol} [N]")
             if turning_s is not None:
-                _mark_time(axes, turning_s * per_second, "no contact", GREY)
+                _draw_time_mark(axes, turning_s * per_second, "no contact", GREY)
         if touched.any():
-            _mark_time(rows[0], time[np.argmax(touched)], "contact", VERMILION)
-        _mark_time(rows[1], detected_s * per_second, "detected", VERMILION)
+            _draw_time_mark(rows[0], time[np.argmax(touched)], "contact", VERMILION)
+        _draw_time_mark(rows[1], detected_s * per_second, "detected", VERMILION)
         for level in (-threshold, threshold):
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
-        _write_note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
-        _write_note(
+        _write_note_above_axes(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
+        _write_note_above_axes(
             rows[1],
             f"peak {_format_number(np.abs(traces[1]).max())} N"
             f"   ·   threshold {_format_number(threshold)} N",
         )
-        rows[0].set_ylim(*_common_range(traces))
+        rows[0].set_ylim(*_common_value_range(traces))
         rows[0].set_xlim(time[0], time[-1])
         rows[1].set_xlabel(f"t [{time_unit}]")
     return figure
@@ -109,7 +109,7 @@ def _time_axis(t: ArrayLike) -> tuple[Array, str]:
     return (seconds * 1e3, "ms") if seconds[-1] - seconds[0] <= 2 else (seconds, "s")
 
 
-def _common_range(traces: Sequence[Array]) -> tuple[float, float]:
+def _common_value_range(traces: Sequence[Array]) -> tuple[float, float]:
     low = min(0.0, *(float(trace.min()) for trace in traces))
     high = max(0.0, *(float(trace.max()) for trace in traces))
     margin = 0.1 * (high - low) or 1.0
@@ -127,11 +127,11 @@ def _format_number(value: float) -> str:
     return f"{rounded:.{decimals}f}"
 
 
-def _write_note(axes: Axes, text: str) -> None:
+def _write_note_above_axes(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
 
 
-def _add_master_axis(axes: Axes, downscaling: float, label: str) -> None:
+def _add_axis_at_master_scale(axes: Axes, downscaling: float, label: str) -> None:
     right = axes.secondary_yaxis(
         "right",
         functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),
@@ -140,7 +140,7 @@ def _add_master_axis(axes: Axes, downscaling: float, label: str) -> None:
     right.spines["right"].set_visible(True)
 
 
-def _mark_time(axes: Axes, time: float, text: str, colour: str) -> None:
+def _draw_time_mark(axes: Axes, time: float, text: str, colour: str) -> None:
     axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
     axes.annotate(
         text,

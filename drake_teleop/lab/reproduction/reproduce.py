@@ -93,7 +93,7 @@ def reproduce_command(
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
         }
-        session = {"speed": _measure_speed(stage("Measure the speed"))}
+        session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
         pictures = draw_figures(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
         with output_folder(out):
@@ -137,7 +137,7 @@ def draw_figures(
     return pictures
 
 
-def _measure_speed(progress: UpdateProgress) -> NamedValues:
+def _measure_simulation_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_time_per_simulated_second(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress

@@ -15,7 +15,7 @@ from drake_teleop.station.simulation import MakeSimulator, advance_without_garba
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_NUM_REPETITIONS, _MEASURED_TIME_S = 11, 0.1  # simulated time of one measurement [s]
+_NUM_TIMINGS, _SIMULATED_TIME_PER_TIMING_S = 11, 0.1  # simulated time of one measurement [s]
 
 
 def MakeBarePlant(scenario: Scenario) -> Simulator:
@@ -49,12 +49,12 @@ def cpu_time_per_simulated_second(
 ) -> dict[str, float]:
     """Return the least CPU time per simulated second of each simulator."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
-    for k in range(_NUM_REPETITIONS):
+    for k in range(_NUM_TIMINGS):
         for name, simulator in simulators.items():
             start = time.thread_time()
             advance_without_garbage_collection(
-                simulator, simulator.get_context().get_time() + _MEASURED_TIME_S
+                simulator, simulator.get_context().get_time() + _SIMULATED_TIME_PER_TIMING_S
             )
-            times_s[name].append((time.thread_time() - start) / _MEASURED_TIME_S)
-        progress((k + 1) / _NUM_REPETITIONS)
+            times_s[name].append((time.thread_time() - start) / _SIMULATED_TIME_PER_TIMING_S)
+        progress((k + 1) / _NUM_TIMINGS)
     return {name: min(times) for name, times in times_s.items()}

@@ -30,7 +30,7 @@ def propose_points(places: Array, objective: ArrayLike, candidates: Array, count
         return list(range(count))
     y = np.where(np.isfinite(y), y, np.nanmax(np.where(np.isfinite(y), y, np.nan)))
     y = (y - y.mean()) / (y.std() or 1.0)
-    lengths, noise = _fit_kernel(places, y)
+    lengths, noise = _fit_kernel_lengths_and_noise(places, y)
     places, candidates = places / lengths, candidates / lengths
     chosen: list[int] = []
     for _ in range(count):
@@ -46,7 +46,7 @@ def propose_points(places: Array, objective: ArrayLike, candidates: Array, count
     return chosen
 
 
-def _fit_kernel(places: Array, y: Array) -> tuple[Array, float]:
+def _fit_kernel_lengths_and_noise(places: Array, y: Array) -> tuple[Array, float]:
     def misfit(x: Array) -> float:
         K = _matern_kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])

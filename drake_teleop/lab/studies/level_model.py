@@ -49,12 +49,12 @@ def missing_value_reasons(
 CONFIDENCE_LEVEL = 0.95
 # Models: number of parts of a range, and whether products of pairs are terms. The first one that
 # leaves half of the points for the residuals is used, or else the last feasible one.
-_MODEL_VARIANTS = (
+_RANGE_PARTS_AND_PRODUCTS_OF_MODELS = (
     *((parts, True) for parts in (5, 4, 3)),
     *((parts, False) for parts in (5, 4, 3, 2)),
 )
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
-_MAX_COMBINATIONS = 50_000
+_MAX_LEVEL_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +65,15 @@ class Levels:
         index: (n,) level of each point.
         names: labels of the levels with a point.
         within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
-        centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
-            one.
+        centred_columns: (n, k) regression columns with zero mean: numbers, or indicators of all
+            values but one.
         middle_columns: (levels, k) these columns at the middle of each level.
     """
 
     index: NDArray[np.int64]
     names: list[str]
     within: Array | None
-    centred: Array
+    centred_columns: Array
     middle_columns: Array
 
 
@@ -151,7 +151,7 @@ class LevelModel:
             effects.append(terms @ coefficients)
             halves.append(
                 np.hypot(
-                    design * self._relative_deviations(terms),
+                    design * self._std_over_residual(terms),
                     self._half_width_over_seeds(table, terms),
                 )
             )
@@ -164,7 +164,7 @@ class LevelModel:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
         return each.mean(axis=1), np.hypot(
-            self._half_width_over_points(table, 1) * self._relative_deviations(terms), over_seeds
+            self._half_width_over_points(table, 1) * self._std_over_residual(terms), over_seeds
         )
 
     def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
@@ -178,7 +178,7 @@ class LevelModel:
         for (i, j), columns in self.products.items():
             if i in at and j in at:
                 a, b = (self.factors[k].middle_columns[at[k]] for k in (i, j))
-                terms[:, columns] = _column_products(a, b)
+                terms[:, columns] = _pairwise_column_products(a, b)
         return terms
 
     @property
@@ -191,7 +191,7 @@ class LevelModel:
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
 
-    def _relative_deviations(self, terms: Array) -> Array:
+    def _std_over_residual(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
     def _half_width_over_points(self, table: Array, together: int) -> float:
@@ -205,7 +205,7 @@ class LevelModel:
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((terms @ self.pseudo_inverse @ apart) ** 2) / (seeds - 1)
         noise = self._residual_variance(apart, seeds - 1) * np.sum(
-            self._relative_deviations(terms) ** 2
+            self._std_over_residual(terms) ** 2
         )
         deviation = np.sqrt(max(moved - noise, 0.0) / len(terms) / seeds)
         return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
@@ -224,11 +224,11 @@ def fit_level_model(
     chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _MODEL_VARIANTS:
+    for parts, products in _RANGE_PARTS_AND_PRODUCTS_OF_MODELS:
         levels = [
             levels_of_factor_values(f, c, parts) for f, c in zip(factors, columns, strict=True)
         ]
-        model = _build_model(levels, products, known, by_chance)
+        model = _build_level_model(levels, products, known, by_chance)
         if model is not None:
             found = model
             if model.X.shape[1] <= len(model.X) / 2:
@@ -236,24 +236,26 @@ def fit_level_model(
     return found
 
 
-def _build_model(
+def _build_level_model(
     factors: list[Levels], products: bool, known: BooleanArray, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
-    failed = _failed_cells(factors, known, by_chance)
+    failed = _find_failed_level_cells(factors, known, by_chance)
     codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
     columns += [f.within[known, None] for f in factors if f.within is not None]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _column_products(factors[i].centred[known], factors[j].centred[known])
+        pair = _pairwise_column_products(
+            factors[i].centred_columns[known], factors[j].centred_columns[known]
+        )
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)
     counts = sorted(len(levels.names) for levels in factors)
     involved = [len(factors[k].names) for k in set(itertools.chain(*failed))] + counts[-2:]
-    if X.shape[1] >= points or math.prod(involved) > _MAX_COMBINATIONS:
+    if X.shape[1] >= points or math.prod(involved) > _MAX_LEVEL_COMBINATIONS:
         return None
     u, size, v = np.linalg.svd(X, full_matrices=False)
     if size[-1] < 1e-6 * size[0]:
@@ -261,7 +263,7 @@ def _build_model(
     return LevelModel(factors, codes, places, failed, X, v.T / size @ u.T)
 
 
-def _failed_cells(
+def _find_failed_level_cells(
     factors: list[Levels], known: BooleanArray, by_chance: bool
 ) -> dict[tuple[int, int], BooleanArray]:
     found = {}
@@ -280,7 +282,7 @@ def _failed_cells(
     return found
 
 
-def _column_products(a: Array, b: Array) -> Array:
+def _pairwise_column_products(a: Array, b: Array) -> Array:
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 

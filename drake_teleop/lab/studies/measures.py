@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drake_teleop.station.scenario import Scenario
 
 
-def _peak_force(forces: Array) -> float:
+def _largest_force_norm(forces: Array) -> float:
     return float(np.linalg.norm(forces, axis=1).max(initial=0.0))
 
 
@@ -26,15 +26,15 @@ def _force_to_master(result: SimulationResult) -> Array:
 def _peak_contact_force(result: SimulationResult, threshold: float) -> float:
     if "true_contact_wrench_W" not in result:
         return 0.0
-    return _peak_force(result["true_contact_wrench_W"][:, :3])
+    return _largest_force_norm(result["true_contact_wrench_W"][:, :3])
 
 
-def _hand_work(result: SimulationResult, threshold: float) -> float:
+def _work_of_hand_on_device(result: SimulationResult, threshold: float) -> float:
     power = np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1)
     return float(np.trapezoid(power, result.t))
 
 
-def _time_above_threshold(result: SimulationResult, threshold: float) -> float:
+def _time_of_felt_force_above(result: SimulationResult, threshold: float) -> float:
     above = np.linalg.norm(_force_to_master(result), axis=1) > threshold
     return float(np.trapezoid(above.astype(float), result.t))
 
@@ -42,16 +42,16 @@ def _time_above_threshold(result: SimulationResult, threshold: float) -> float:
 #: Measures of every run, from its signals and the study's `force_threshold` [N].
 _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
     # Largest displayed force.
-    "peak_force_to_master_N": lambda result, _: _peak_force(_force_to_master(result)),
+    "peak_force_to_master_N": lambda result, _: _largest_force_norm(_force_to_master(result)),
     "rms_force_to_master_N": lambda result, _: float(
         np.sqrt(np.mean(np.sum(_force_to_master(result) ** 2, axis=1)))
     ),
     # Largest true force between tool and environment.
     "peak_contact_force_N": _peak_contact_force,
     # Work of the hand on the stylus: integral of F.v + tau.omega.
-    "hand_work_J": _hand_work,
+    "hand_work_J": _work_of_hand_on_device,
     # Time of a displayed force above the threshold.
-    "time_above_force_s": _time_above_threshold,
+    "time_above_force_s": _time_of_felt_force_above,
 }
 
 

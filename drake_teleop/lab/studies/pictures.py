@@ -87,7 +87,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     _label_levels(axes, found.level_names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched_cell(found.missing_reasons[level], (level - 0.5, 0.0))
+        bar = _hatched_cell_without_value(found.missing_reasons[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
@@ -95,7 +95,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
-    axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
+    axes.set_title(_describe_used_combinations(found), fontsize=7, color=GREY, loc="right")
 
 
 def _label_levels(axes: Axes, levels: list[str]) -> None:
@@ -105,21 +105,21 @@ def _label_levels(axes: Axes, levels: list[str]) -> None:
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
 
-def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
+def _describe_used_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
     if not found.num_unused_combinations:
         return ""
     used, unused = found.num_used_combinations, found.num_unused_combinations
     return f"over {used} of {used + unused} combinations of the rest"
 
 
-def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
+def _hatched_cell_without_value(why: str, corner: tuple[float, float]) -> Rectangle:
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCH_OF_REASON[why], fc="white", ec=GREY, lw=0)
 
 
 def _draw_reason_legend(figure: Figure, reasons: Iterable[str]) -> None:
     names = [why for why in _HATCH_OF_REASON if why in reasons and why != TOO_FEW_POINTS]
     if names:
-        patches = [_hatched_cell(why, (0.0, 0.0)) for why in names]
+        patches = [_hatched_cell_without_value(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
@@ -137,14 +137,16 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
                 axes.add_patch(
-                    _hatched_cell(found.missing_reasons[row, column], (column - 0.5, row - 0.5))
+                    _hatched_cell_without_value(
+                        found.missing_reasons[row, column], (column - 0.5, row - 0.5)
+                    )
                 )
             axes.grid(False)
             _label_levels(axes, found.level_names[1])
             axes.set_yticks(range(len(found.level_names[0])), found.level_names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
-            axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
+            axes.set_title(_describe_used_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)

@@ -54,23 +54,26 @@ def open_executor(
             )
         yield RunExecutor(
             getattr(executor, "_max_workers", max(jobs, 1)),
-            lambda run, chunks: _run_on_custom_executor(run, chunks, executor),
+            lambda run, chunks: _run_on_given_executor(run, chunks, executor),
         )
         return
     if cluster is None:
         from joblib import effective_n_jobs
 
         yield RunExecutor(
-            effective_n_jobs(jobs), lambda run, chunks: _run_locally(run, chunks, store, jobs)
+            effective_n_jobs(jobs),
+            lambda run, chunks: _run_in_local_processes(run, chunks, store, jobs),
         )
         return
     with _open_dask_client(cluster, jobs) as client:
-        _check_versions(client)
+        _check_worker_versions(client)
         workers = sum(client.nthreads().values())
         yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+def _run_in_local_processes(
+    run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int
+) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
@@ -82,7 +85,7 @@ def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
-            for found in _joblib_pool(jobs)(_delayed_task(run, chunk, store) for chunk in left):
+            for found in _joblib_pool(jobs)(_joblib_task(run, chunk, store) for chunk in left):
                 done.add(found[0]["run"])
                 yield found
         except BrokenExecutor as error:
@@ -112,7 +115,7 @@ def _joblib_pool(jobs: int) -> Any:
     )
 
 
-def _delayed_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
+def _joblib_task(run: RunRows, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
     return delayed(_run_and_count_start)(run, chunk, store)
@@ -123,7 +126,7 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
     for row in chunk:
         try:
             # With one job joblib would run it in this process.
-            found += next(_joblib_pool(2)([_delayed_task(run, [row], store)]))
+            found += next(_joblib_pool(2)([_joblib_task(run, [row], store)]))
         except BrokenExecutor:
             found.append(row | {"error": PROCESS_ENDED_ERROR})
     store.clear_starts(chunk[0]["run"])
@@ -180,7 +183,7 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _run_on_custom_executor(
+def _run_on_given_executor(
     run: RunRows, chunks: Sequence[Chunk], executor: Executor
 ) -> Iterator[Chunk]:
     futures = [executor.submit(run, chunk) for chunk in chunks]
@@ -198,7 +201,7 @@ def _run_on_custom_executor(
             future.cancel()
 
 
-def _check_versions(client: Any) -> None:
+def _check_worker_versions(client: Any) -> None:
     for worker, found in client.run(_make_version_reader(), on_error="return").items():
         if found != __version__:
             raise _version_error(worker, found, __version__)

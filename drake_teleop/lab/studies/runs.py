@@ -33,7 +33,7 @@ RunFunction: TypeAlias = Callable[[FactorValues, int], dict[str, float]]
 
 ONE_TIME_COST_KEY = "seconds_once"
 """Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
-_RUN_TIME_KEY = "seconds"
+_RUN_SECONDS_KEY = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
@@ -41,7 +41,7 @@ _MAX_RUNS_PER_CHUNK = 8
 _TARGET_NUM_CHUNKS = 512
 _NUM_SINGLE_RUN_CHUNKS = 64
 # Number of latest runs for the estimate of the remaining time.
-_NUM_RECENT_RUNS = 16
+_NUM_RUNS_FOR_TIME_ESTIMATE = 16
 
 
 def run_study(
@@ -76,7 +76,7 @@ def run_study(
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
     identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
-    schema = _table_schema(study, first_rows[0])
+    schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = (
         _group_into_chunks(first_rows)
@@ -103,7 +103,9 @@ def run_study(
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
-                    new = study.next_points(points, _objective_of_points(study, store, len(points)))
+                    new = study.next_points(
+                        points, _mean_objective_of_points(study, store, len(points))
+                    )
                     chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
@@ -123,7 +125,7 @@ def _group_into_chunks(rows: Chunk) -> list[Chunk]:
     return chunks
 
 
-def _objective_of_points(study: Study, store: Store, points: int) -> Array:
+def _mean_objective_of_points(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -139,7 +141,7 @@ class StudyProgress:
 
     def __init__(self, total: int) -> None:
         self.total, self.done, self._num_timed = total, 0, 0
-        self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
+        self._recent: deque[float] = deque(maxlen=_NUM_RUNS_FOR_TIME_ESTIMATE)
 
     def start(self, progress: UpdateProgress, processes: int) -> None:
         self._progress, self._processes = progress, processes
@@ -152,9 +154,9 @@ class StudyProgress:
         """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
-            if _RUN_TIME_KEY in row:  # missing if the run ended its process
-                first = self._num_timed < _NUM_RECENT_RUNS
-                self._recent.append(row[_RUN_TIME_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
+            if _RUN_SECONDS_KEY in row:  # missing if the run ended its process
+                first = self._num_timed < _NUM_RUNS_FOR_TIME_ESTIMATE
+                self._recent.append(row[_RUN_SECONDS_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
                 self._num_timed += 1
         self._report_progress()
 
@@ -188,11 +190,11 @@ def _run_chunk(
             except Exception as error:  # other runs must continue
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
             # Not stored in the table, which must be reproducible.
-            found.append(row | measures | {_RUN_TIME_KEY: time.monotonic() - start})
+            found.append(row | measures | {_RUN_SECONDS_KEY: time.monotonic() - start})
     return found
 
 
-def _table_schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:
+def _schema_of_run_table(study: Study, row: dict[str, Any]) -> dict[str, Any]:
     import polars as pl
 
     vector = pl.List(pl.Float64)

@@ -44,8 +44,8 @@ _ETA_STUDY_NAME = "scaling_object"
 _SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
     f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
 )
-_NUM_DRAWS, _SEED = 2000, 0
-_MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
+_NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
+_MAX_FAILED_RUN_SHARE, _MIN_SHARE_OF_DRAWS_AS_BEST = 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +86,15 @@ def scaling_study_command(
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    sigmas, gammas = _scale_axes()
+    sigmas, gammas = _sigmas_and_gammas()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
     }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
-            selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
+            selection: _find_best_scales(found, sigmas, gammas)
+            for selection, found in answers.items()
         },
         "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
@@ -112,16 +113,18 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
+    draws = np.random.default_rng(_BOOTSTRAP_SEED).multinomial(
+        count, np.full(count, 1 / count), _NUM_BOOTSTRAP_DRAWS
+    )
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_relative_means(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_means_over_unscaled(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
     merits = np.mean(parts, axis=0)
     failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
-    usable = failures <= _MAX_FAILURE_SHARE
+    usable = failures <= _MAX_FAILED_RUN_SHARE
     # Draws in which the reference has no successful run are undefined.
     known = np.isfinite(merits[:, usable]).all(axis=1)
     merits[:, ~usable] = np.nan
@@ -135,21 +138,21 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     return ScaleRating(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _relative_means(table: Array, weights: Array) -> Array:
+def _means_over_unscaled(table: Array, weights: Array) -> Array:
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
         means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
-    return means / means[:, -1, _scale_axes()[1].index(1.0), None, None]  # sigma = gamma = 1
+    return means / means[:, -1, _sigmas_and_gammas()[1].index(1.0), None, None]  # sigma = gamma = 1
 
 
-def _scale_axes() -> tuple[list[float], list[float]]:
+def _sigmas_and_gammas() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
     return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
 
 
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
-    sigmas, gammas = _scale_axes()
+    sigmas, gammas = _sigmas_and_gammas()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
@@ -163,13 +166,13 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _best_scales(
+def _find_best_scales(
     found: ScaleRating, sigmas: list[float], gammas: list[float]
 ) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best_share >= _MIN_BEST_SHARE)
+    near = np.argwhere(found.best_share >= _MIN_SHARE_OF_DRAWS_AS_BEST)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
@@ -275,7 +278,7 @@ def draw_best_scales(
             axes.set_title(f"counts: {selection}")
             for i, j in np.ndindex(found.merit.shape):
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
-                axes.text(j, i, _cell_text(found, i, j), color="white" if dark else "black",
+                axes.text(j, i, _merit_cell_text(found, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
         bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
@@ -286,7 +289,7 @@ def draw_best_scales(
     return figure
 
 
-def _cell_text(found: ScaleRating, i: int, j: int) -> str:
+def _merit_cell_text(found: ScaleRating, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
         return f"{found.failure_share[i, j]:.0%} fail"
     best = f"\nbest: {found.best_share[i, j]:.0%}" if found.best_share[i, j] >= 0.005 else ""

@@ -18,7 +18,7 @@ from drake_teleop.lab.studies.processes import Chunk
 from drake_teleop.lab.studies.store import Store, write_or_check_identity
 
 _SHARD_FOLDER_PATTERN = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
-_MAX_LISTED_SHARDS = 20
+_MAX_SHARDS_IN_MESSAGE = 20
 
 
 class Shard(NamedTuple):
@@ -67,8 +67,8 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
     if missing:
         count = max(shard.total for shard in shards)
         numbers = sorted({k % count + 1 for k in missing})
-        listed = ",".join(map(str, numbers[:_MAX_LISTED_SHARDS]))
-        more = ",..." if len(numbers) > _MAX_LISTED_SHARDS else ""
+        listed = ",".join(map(str, numbers[:_MAX_SHARDS_IN_MESSAGE]))
+        more = ",..." if len(numbers) > _MAX_SHARDS_IN_MESSAGE else ""
         runs = sum(len(chunks[k]) for k in missing)
         raise DrakeTeleopError(
             f"{runs} of {sum(map(len, chunks))} runs are missing",

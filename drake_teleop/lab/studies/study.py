@@ -51,7 +51,9 @@ class StationRunFunction:
 
     def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_apply_changes(self.scenario_data, changes), self.scenario_file)
+        return ScenarioFromData(
+            _set_scenario_fields(self.scenario_data, changes), self.scenario_file
+        )
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
@@ -101,7 +103,7 @@ def study_command(
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _apply_changes({}, {factor.field: value})
+            changed = _set_scenario_fields({}, {factor.field: value})
             place = f"{path}:factors[{index}]"
             check_ranges(settings_from_data(Scenario, changed, place), place)
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
@@ -110,7 +112,7 @@ def study_command(
         study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
         shard=shard, merge=merge, progress=shown,
     )  # fmt: skip
-    summary = _summarise_rows(study, rows)
+    summary = _summarise_measures(study, rows)
     out = parse_shard(shard).folder(out) if shard else out
     with output_folder(out, kept=["runs.parquet"]):
         if not shard:
@@ -132,7 +134,7 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:
+def _set_scenario_fields(data: Any, changes: dict[str, Any]) -> Any:
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")
@@ -147,7 +149,7 @@ def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:
     return data
 
 
-def _summarise_rows(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
+def _summarise_measures(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
     figures = {}
     for name in study.measures:
         column = rows[name].drop_nulls()

@@ -39,15 +39,15 @@ from drake_teleop.station.station import MakeTeleopStation
 MAX_REST_FORCE_N = 0.05
 """Largest rendered force above `REST_BAND_HZ` of a station at rest, free or pressing, rms [N]."""
 REST_BAND_HZ = 5.0
-MIN_RENDERED_SHARE = 0.9
+MIN_RENDERED_FORCE_SHARE = 0.9
 """Smallest accepted rendered force, as a share of the scaled contact force."""
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
 _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
-_MAX_DEVICE_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
+_USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
+_LEAF_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _FILTER_DELAY_CYCLES = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
@@ -56,7 +56,7 @@ GIVEN_SETTINGS_NAME = "as given"
 
 
 @dataclass(frozen=True)
-class Settings:
+class TunedSettings:
     """Settings that `tune` chooses."""
 
     method: str
@@ -87,9 +87,9 @@ class Settings:
         )
 
 
-def settings_from_values(values: FactorValues) -> Settings:
-    names = [entry.name for entry in dataclasses.fields(Settings)]
-    return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
+def settings_from_values(values: FactorValues) -> TunedSettings:
+    names = [entry.name for entry in dataclasses.fields(TunedSettings)]
+    return TunedSettings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -98,22 +98,22 @@ class StationTrial:
 
     Args:
         user_scenario: scenario of the user, with its own passivity and scales.
-        base: the same without environment, task and passivity method.
-        estimate: (16,) load estimate.
+        base_scenario: the same without environment, task and passivity method.
+        load_estimate: (16,) load estimate.
     """
 
     user_scenario: Scenario
-    base: Scenario
-    stated: StatedSet
-    estimate: Array
+    base_scenario: Scenario
+    stated_set: StatedSet
+    load_estimate: Array
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
         if values["method"] != GIVEN_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base, self.stated)
+            scenario = settings_from_values(values).apply(self.base_scenario, self.stated_set)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
-        channel = self.base.channel
+        channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
@@ -121,10 +121,10 @@ class StationTrial:
             scenario.passivity,
             wall,
             task=task,
-            depth=press_depth(self.base, grip),
+            depth=press_depth(self.base_scenario, grip),
         )
-        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
-        station = MakeTeleopStation(setup, load_estimate=self.estimate)
+        setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
+        station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
@@ -139,11 +139,11 @@ class StationTrial:
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
-            rms_above(felt, period, REST_BAND_HZ),
-            *(rms_above(force, period, REST_BAND_HZ) for force in free_felt),
+            rms_above_hz(felt, period, REST_BAND_HZ),
+            *(rms_above_hz(force, period, REST_BAND_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
-        human = self.base.operator.perception
+        human = self.base_scenario.operator.perception
         smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
         return {
             "rests": float(found.stable),
@@ -159,19 +159,22 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `gamma_caps`: low-pass [Hz] -> upper bound of gamma.
+    `gamma_upper_bounds`: low-pass [Hz] -> upper bound of gamma.
     """
 
-    base: Scenario
-    stated: StatedSet
-    gamma_caps: dict[float, float]
+    base_scenario: Scenario
+    stated_set: StatedSet
+    gamma_upper_bounds: dict[float, float]
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         settings = settings_from_values(values | {"gamma": 1.0})
-        axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
+        axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = self.gamma_caps[settings.low_pass_hz] * self.stated.requirements.margin
+        cap = (
+            self.gamma_upper_bounds[settings.low_pass_hz]
+            * self.stated_set.requirements.loop_gain_margin
+        )
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -179,10 +182,11 @@ class GammaSearch:
         def stability_sign(log_gamma: float) -> float:
             gamma = float(np.exp(log_gamma))
             found = [
-                self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
+                self.share_in_one_axis(axis, settings, gamma, *c, seed)
+                for c in self.stated_set.corners
             ]
             shares[gamma] = min(found)
-            return 1.0 if shares[gamma] >= MIN_RENDERED_SHARE else -1.0
+            return 1.0 if shares[gamma] >= MIN_RENDERED_FORCE_SHARE else -1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
@@ -192,17 +196,17 @@ class GammaSearch:
                 if stability_sign(low) > 0
                 else -np.inf
             )
-        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_SHARE]
+        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_FORCE_SHARE]
         gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
-    def _linear_gamma_limit(self, axis: Any, settings: Settings) -> float:
-        sampling = sampling_of_scenario(self.base)
+    def _linear_gamma_limit(self, axis: Any, settings: TunedSettings) -> float:
+        sampling = sampling_of_scenario(self.base_scenario)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_TESTED_GAMMAS), dtype=bool)
-        for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
+        for grip, wall in [*self.stated_set.corners, (self.stated_set.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _TESTED_GAMMAS}
             held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
             stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
@@ -211,14 +215,14 @@ class GammaSearch:
     def share_in_one_axis(
         self,
         axis: AxisParameters,
-        settings: Settings,
+        settings: TunedSettings,
         gamma: float,
         grip: str,
         wall: float,
         seed: int,
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
-        forward, backward = self.base.channel.networks_of_directions()
+        forward, backward = self.base_scenario.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
         shown = {
             entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
@@ -227,11 +231,15 @@ class GammaSearch:
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = 0.0 if self.base.wrist_sensor.ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        added = (
+            0.0
+            if self.base_scenario.wrist_sensor.ideal
+            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
+        )
         task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
-            settings.passivity(self.stated),
+            settings.passivity(self.stated_set),
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,
@@ -239,7 +247,7 @@ class GammaSearch:
         )
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
+        quiet = rms_above_hz(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
@@ -263,10 +271,10 @@ def press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
-    return min(_MAX_PRESS_DEPTH_M, _MAX_DEVICE_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
+    return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
-def rms_above(x: Array, period: float, frequency: float) -> float:
+def rms_above_hz(x: Array, period: float, frequency: float) -> float:
     """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")

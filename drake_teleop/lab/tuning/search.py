@@ -20,24 +20,24 @@ from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
     GIVEN_SETTINGS_NAME,
     MAX_REST_FORCE_N,
-    MIN_RENDERED_SHARE,
+    MIN_RENDERED_FORCE_SHARE,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
-    Settings,
     StationTrial,
+    TunedSettings,
     settings_from_values,
 )
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_SHARE`."""
+"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_FORCE_SHARE`."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
-WALL_FACTORS = (1.2, 2.0)
+STIFFEST_WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
-_BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
+_MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
 _MAX_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
@@ -55,7 +55,7 @@ class SearchResult:
         limit_runs: runs of the chosen settings at the stiffest wall and at stiffer ones.
     """
 
-    settings: Settings
+    settings: TunedSettings
     searched_settings: list[Row]
     given_runs: list[Row]
     corner_runs: list[Row]
@@ -64,17 +64,19 @@ class SearchResult:
 
 def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest force."""
-    base, stated = trial.base, trial.stated
+    base, stated = trial.base_scenario, trial.stated_set
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     given = execute(
         "as_given",
-        _study_of_settings(Settings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
+        _study_of_settings(TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
         trial,
     )
     quiet = execute(
-        "noise", _study_of_settings(Settings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]), trial
+        "noise",
+        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]),
+        trial,
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -92,12 +94,12 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         measures=SEARCH_MEASURES,
     )
     rows = execute("search", study, GammaSearch(base, stated, caps))
-    search = [_predict_threshold(row, trial, noises) for row in rows]
+    search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
             candidates.setdefault(row["method"], row)
-    found: list[tuple[float, Settings, list[Row]]] = []
+    found: list[tuple[float, TunedSettings, list[Row]]] = []
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
@@ -113,15 +115,18 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
+    walls = [stiffest, *(factor * stiffest for factor in STIFFEST_WALL_FACTORS)]
     limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
     return SearchResult(chosen, search, given, inside, limits)
 
 
 def _find_gamma_limit_in_station(
-    settings: Settings, trial: StationTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    margin, ends = (trial.stated.requirements.margin, [c[0] for c in trial.stated.corners])
+    margin, ends = (
+        trial.stated_set.requirements.loop_gain_margin,
+        [c[0] for c in trial.stated_set.corners],
+    )
     hands = list(dict.fromkeys(ends))
     tries = 0
 
@@ -130,7 +135,7 @@ def _find_gamma_limit_in_station(
         tried = dataclasses.replace(settings, gamma=margin * gamma)
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
-        for wall in dict.fromkeys(trial.stated.walls[::-1]):
+        for wall in dict.fromkeys(trial.stated_set.walls[::-1]):
             name = f"station_{settings.method}_{tries}_{wall:.0f}"
             rows += execute(name, _study_of_settings(tried, hands, [wall]), trial)
             if not all(meets_requirements(row, margin) for row in rows):
@@ -147,7 +152,7 @@ def _find_gamma_limit_in_station(
         gamma, failed = gamma / 2, gamma
     if not inside:
         return gamma, []
-    while failed > _BISECTION_RATIO * gamma:
+    while failed > _MAX_UNSTABLE_OVER_STABLE_GAMMA * gamma:
         middle = float(np.sqrt(gamma * failed))
         if rows := run_at_gamma(middle):
             gamma, inside = middle, rows
@@ -159,7 +164,7 @@ def _find_gamma_limit_in_station(
 def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_SHARE)
+    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_FORCE_SHARE)
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
@@ -180,10 +185,13 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
-    gamma = row["gamma_limit"] / trial.stated.requirements.margin
-    human, scale = (trial.base.operator.perception, trial.base.force_scaling.force_scale)
-    masked = row["sigma_inertia"] * scale * _rms_load_force(trial)
+def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+    gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
+    human, scale = (
+        trial.base_scenario.operator.perception,
+        trial.base_scenario.force_scaling.force_scale,
+    )
+    masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noises[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
@@ -191,12 +199,12 @@ def _predict_threshold(row: Row, trial: StationTrial, noises: dict[float, float]
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _rms_load_force(trial: StationTrial) -> float:
+def _rms_load_force_in_swing(trial: StationTrial) -> float:
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
-    return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+    return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of_settings(settings: Settings, hands: list[str], walls: list[float]) -> Study:
+def _study_of_settings(settings: TunedSettings, hands: list[str], walls: list[float]) -> Study:
     factors = [
         Factor(field="method", words=[settings.method]),
         Factor(field="gamma", values=[settings.gamma]),

@@ -24,11 +24,11 @@ class TaskRequirements:
     """Requirements of a task.
 
     Args:
-        margin: factor of the loop gain that must still be stable.
+        loop_gain_margin: factor of the loop gain that must still be stable.
         min_low_pass_hz: lowest bandwidth of the sensor; a lower one delays the contact force.
     """
 
-    margin: float
+    loop_gain_margin: float
     min_low_pass_hz: float
 
 

@@ -21,7 +21,7 @@ from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
+from drake_teleop.lab.tuning.press_trial import StationTrial, TunedSettings
 from drake_teleop.lab.tuning.search import (
     SearchResult,
     make_study_executor,
@@ -88,7 +88,7 @@ def tune(
         environment=given.environment,
         contact_detection=given.contact_detection,
     )
-    summary = _make_summary(found, tuned, stated, network)
+    summary = _make_tuning_summary(found, tuned, stated, network)
     with output_folder(out):
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
@@ -110,7 +110,7 @@ def tune(
     return summary
 
 
-def _make_summary(
+def _make_tuning_summary(
     found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limit_runs if row["wall"] <= stated.walls[1]]
@@ -124,7 +124,7 @@ def _make_summary(
         if all(map(meets_requirements, found.given_runs))
         else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
-        "margin": stated.requirements.margin,
+        "margin": stated.requirements.loop_gain_margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
         if failed
         else None,
@@ -141,14 +141,14 @@ def _make_summary(
         "settings": settings,
         "stated": about,
         "figures": figures,
-        "sentences": _result_sentences(found.settings, figures, about, scale),
+        "sentences": _tuning_result_sentences(found.settings, figures, about, scale),
         "search": found.searched_settings,
         "trials": [*found.given_runs, *found.corner_runs, *found.limit_runs],
     }
 
 
-def _result_sentences(
-    chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
+def _tuning_result_sentences(
+    chosen: TunedSettings, figures: dict[str, Any], about: dict[str, Any], scale: float
 ) -> list[str]:
     low, high = (1e-3 * wall for wall in about["walls"])
     hands = " to ".join(dict.fromkeys((about["hands"][0], about["hands"][-1])))
