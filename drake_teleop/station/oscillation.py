@@ -16,7 +16,7 @@ Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
 _MIN_SWING_M, _MIN_SWING_RAD = 5e-4, np.deg2rad(0.5)
-REVERSAL_DELAY_S = 0.25
+MAX_REVERSAL_DELAY_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
 MAX_FORCE_RIPPLE_AT_REST_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
@@ -53,7 +53,7 @@ def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
 
 
 def flag_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_DELAY_S
+    t: Array, command: Array, actual: Array, swing: float, near: float = MAX_REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
@@ -122,7 +122,7 @@ def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
 class Chatter(NamedTuple):
     """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
 
-    touches: int
+    num_touches: int
     rate_hz: float
     peak_force: float
     start: float

@@ -18,7 +18,7 @@ from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
     MAX_FORCE_RIPPLE_AT_REST_N,
-    REVERSAL_DELAY_S,
+    MAX_REVERSAL_DELAY_S,
     find_chatter,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
@@ -51,7 +51,7 @@ _MIN_COMMAND_LAG_M, _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = (
     np.deg2rad(0.2),
 )
 # Settling time of the command of `ledger` with sufficient energy [s].
-_LEDGER_SETTLING_S = 0.05
+_LEDGER_COMMAND_SETTLING_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
 _MIN_JOINT_OSCILLATION_RAD = np.deg2rad(0.1)
@@ -186,7 +186,9 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             spans,
         )
     yield from _check_reserve_speed_limit(result, scenario)
-    oscillating = flag_unexplained_pose_oscillation(t, sent, received, REVERSAL_DELAY_S + window)
+    oscillating = flag_unexplained_pose_oscillation(
+        t, sent, received, MAX_REVERSAL_DELAY_S + window
+    )
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     yield f"the channel ({by}) makes the slave's command oscillate", spans
 
@@ -200,11 +202,13 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
     mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
     limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
     then = t - _newest_packet_ages_s(t, scenario)
-    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_S
+    window = (
+        longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_COMMAND_SETTLING_S
+    )
     parts = _pose_parts_with_lag_limits(sent, received)
     for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_S)
+        far = lag_beyond_delay(t, asked, actual, _LEDGER_COMMAND_SETTLING_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
         speed = _maximum_of_last_rows(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
@@ -269,7 +273,7 @@ def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: Arm
 def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
         oscillating = flag_unexplained_pose_oscillation(
-            result.t, result["intent"], result["pose_master"], REVERSAL_DELAY_S
+            result.t, result["intent"], result["pose_master"], MAX_REVERSAL_DELAY_S
         )
         spans = find_spans(result.t, oscillating, _MIN_WARNING_SPAN_S)
         yield "the hand oscillates while its intent does not,", spans
@@ -284,7 +288,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if found := find_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
-            f"contact chatter of the tool: {sum(chatter.touches for chatter in found)} touches at"
+            f"contact chatter of the tool: {sum(chatter.num_touches for chatter in found)} touches at"
             f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N (damp the touched object:"
             " dissipation of its surface or damping of its joint; or reduce"
             " force_scaling.force_scale or kinematic_scaling.translation_scale),",

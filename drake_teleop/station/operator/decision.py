@@ -49,7 +49,7 @@ DECISION_PERIOD_S = 0.005
     _TASK_START_TIME,
     _TASK_TIMEOUT,
     _GOAL_TRANSLATION,
-    _AXIS,
+    _APPROACH_AXIS,
     _TARGET_RADIUS,
     _DWELL_TIME,
 ) = 0, 1, 2, 3, 6, 9, 10
@@ -105,7 +105,7 @@ def pack_task_parameters(task: Task) -> Array:
     packed[_TASK_KIND] = TASK_CLASSES.index(type(task))
     packed[[_TASK_START_TIME, _TASK_TIMEOUT]] = task.t_start, task.timeout
     packed[_GOAL_TRANSLATION : _GOAL_TRANSLATION + 3] = task.translation
-    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.target_distance
+    packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = np.array(task.translation) / task.target_distance
     if isinstance(task, Reach):
         packed[[_TARGET_RADIUS, _DWELL_TIME]] = task.width / 2, task.dwell
         return packed
@@ -114,7 +114,7 @@ def pack_task_parameters(task: Task) -> Array:
     if isinstance(task, Press):
         packed[[_SET_FORCE, _FORCE_TOLERANCE]] = task.force, task.tolerance
     if isinstance(task, Insert):
-        packed[_AXIS : _AXIS + 3] = 0.0, 0.0, -1.0
+        packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = 0.0, 0.0, -1.0
         packed[[_SET_FORCE, _SLOT_DEPTH]] = task.push, task.depth
     return packed
 
@@ -141,7 +141,7 @@ _STEP_COUNT, _NEXT_MOVE_TIME, _CRITERION_MET_SINCE, _ASSUMED_CONTACT_STIFFNESS =
 _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_START_INDEX + PLAN_SIZE
 
-_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
+_EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
 _MOVE_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
 _APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
 # Perceived depth without contact beyond which the operator gives up, estimate.
@@ -155,7 +155,7 @@ _STUCK_SHARE_OF_PUSH_FORCE = 0.5  # share of the push force above which the peg 
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
 _SEARCH_SPIRAL_SCALE_M, _GOLDEN_ANGLE_RAD = 0.5e-3, 2.399963
-_DEPTH_SHARE_AT_FLOOR = 0.8  # share of the depth beyond which contact counts as the floor, estimate
+_FLOOR_DEPTH_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
@@ -188,7 +188,9 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
-        noise = person[_VISION_NOISE] * _draw_normal_number(person, step // _FIXATION_STEPS, 4 + i)
+        noise = person[_VISION_NOISE] * _draw_normal_number(
+            person, step // _EYE_FIXATION_STEPS, 4 + i
+        )
         seen_W[i] = displacement_W[i] + noise
 
 
@@ -212,7 +214,7 @@ def _contact_force_against_axis(task, person, felt):
     for i in range(3):
         axis_B = 0.0
         for k in range(3):
-            axis_B += person[_R_WB + 3 * k + i] * task[_AXIS + k]
+            axis_B += person[_R_WB + 3 * k + i] * task[_APPROACH_AXIS + k]
         along -= felt[i] * axis_B
     return along / person[_FORCE_GAIN] if person[_FORCE_GAIN] > 0.0 else 0.0
 
@@ -287,7 +289,7 @@ def _perceived_target_into(task, person, out):
     if task[_TASK_KIND] != KIND_REACH:
         depth = person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
     for i in range(3):
-        out[i] = task[_GOAL_TRANSLATION + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
+        out[i] = task[_GOAL_TRANSLATION + i] + (depth - task[_STANDOFF]) * task[_APPROACH_AXIS + i]
         if task[_TASK_KIND] == KIND_INSERT and i < 2:
             out[i] += person[_AIM_ERROR] * _draw_normal_number(person, 0, 13 + i)
 
@@ -297,7 +299,7 @@ def _perceived_penetration(task, person, seen_W):
     target, beyond = np.empty(3), -task[_STANDOFF]
     _perceived_target_into(task, person, target)
     for i in range(3):
-        beyond += (seen_W[i] - target[i]) * task[_AXIS + i]
+        beyond += (seen_W[i] - target[i]) * task[_APPROACH_AXIS + i]
     return beyond
 
 
@@ -343,7 +345,9 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
     elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
-            velocity_W[i] = state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
+            velocity_W[i] = (
+                state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_APPROACH_AXIS + i]
+            )
         _convert_to_hand_motion(person, velocity_W, speed)
         plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
         for i in range(3):
@@ -385,7 +389,9 @@ def _control_press_force(task, person, step, time, felt, state, memory):
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
         move = _displacement_to_set_force(task, memory, force)
-        duration = _plan_submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
+        duration = _plan_submovement(
+            person, memory, step, time, move * task[_APPROACH_AXIS : _APPROACH_AXIS + 3]
+        )
         memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]
 
 
@@ -393,7 +399,7 @@ def _control_press_force(task, person, step, time, felt, state, memory):
 def _lateral_force_into(task, person, felt, out):
     along, size = _contact_force_against_axis(task, person, felt), 0.0
     for i in range(3):
-        out[i] = along * task[_AXIS + i]
+        out[i] = along * task[_APPROACH_AXIS + i]
         for k in range(3):
             if person[_FORCE_GAIN] > 0.0:
                 out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_FORCE_GAIN]
@@ -420,7 +426,7 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_penetration(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_SLOT_DEPTH]
+    deep = _perceived_penetration(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task[_SLOT_DEPTH]
     if deep and abs(force - task[_SET_FORCE]) <= _STUCK_SHARE_OF_PUSH_FORCE * task[_SET_FORCE]:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
@@ -437,6 +443,6 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
             move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
     for i in range(3):
-        move[i] += push * task[_AXIS + i]
+        move[i] += push * task[_APPROACH_AXIS + i]
     duration = _plan_submovement(person, memory, step, time, move)
     memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]

@@ -78,7 +78,7 @@ _MAX_WALL_STIFFNESS, _MIN_WALL_STIFFNESS = 2500.0, 50.0  # N/m
 _HAND_PREDICTION_LEAD_STEPS = 2.0
 _HAND_OFFSET_FADE_S = 0.3
 _FRICTION_COEFFICIENT_DECAY_S = 1.0
-_MIN_FRICTION_RELAXATION_S, _SLIP_SPEED = 0.1, 1e-3
+_MIN_FRICTION_RELAXATION_S, _FRICTION_SLIP_SPEED = 0.1, 1e-3
 _FRICTION_TORQUE_RELAXATION_S, _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS = 0.6, 30.0
 _ROTATION_FRICTION_STIFFNESS_FACTOR, _MAX_FRICTION_COEFFICIENT = 4.0, 1.0
 _MIN_WRENCH_NORM_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
@@ -105,7 +105,7 @@ _layout = own_memory()
 _layout.vector(CONTACT_DIRECTION.stop - FILTERED_OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
-_HAND_OFFSET_AT_CONTACT_ONSET, _INTO_WALL = _layout.vector(6), _layout.vector(6)
+_HAND_OFFSET_AT_CONTACT_ONSET, _DIRECTION_INTO_WALL = _layout.vector(6), _layout.vector(6)
 _WALL_STIFFNESS, _HAND_WALL_DEPTH, _MISSING_WALL_IMPULSE = (_layout.number() for _ in range(3))
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
 _MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE = _layout.vector(6), _layout.vector(6)
@@ -192,7 +192,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
     filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
-    memory[_HAND_WALL_DEPTH] += work_along(memory[_INTO_WALL], steady)
+    memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
@@ -262,7 +262,11 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal, inward = received[WRENCH], memory[CONTACT_DIRECTION], memory[_INTO_WALL]
+    contact_wrench, normal, inward = (
+        received[WRENCH],
+        memory[CONTACT_DIRECTION],
+        memory[_DIRECTION_INTO_WALL],
+    )
     k = min(_CONTACT_STIFFNESS_FACTOR * received[PACKET_CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
     if not is_in_contact(contact_wrench, p):
         if memory[IN_CONTACT] > 0.0:
@@ -359,7 +363,10 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
         metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
-        lag = max(cone[g] * size / (_MAX_WALL_STIFFNESS * _SLIP_SPEED), _MIN_FRICTION_RELAXATION_S)
+        lag = max(
+            cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED),
+            _MIN_FRICTION_RELAXATION_S,
+        )
         if g == 1:
             lag = max(
                 _FRICTION_TORQUE_RELAXATION_S,

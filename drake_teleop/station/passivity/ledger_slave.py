@@ -107,7 +107,9 @@ _MOTOR_WRENCH = _layout.vector(6)
 _AVAILABLE_MOTOR_ENERGY, _ENERGY_IN_CONTACT = _layout.vector(2), _layout.vector(2)  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
 _CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
-_STIFFNESS_SHARE, _SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_DEPTH = (_layout.number() for _ in range(4))
+_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
+    _layout.number() for _ in range(4)
+)
 # Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
 # lag of its filter; length of the fit and its sums.
 _FILTERED_FORCE, _FIT_SAMPLE_START_FORCE, _FIT_SAMPLE_START_SPEED = (
@@ -116,8 +118,10 @@ _FILTERED_FORCE, _FIT_SAMPLE_START_FORCE, _FIT_SAMPLE_START_SPEED = (
 _FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
 _FIT_SUMS = _layout.vector(NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
-_CONTACT_WRENCH, _FILTERED_LOAD = _layout.vector(6), _layout.vector(6)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _STEP_PERIOD = (
+    _layout.number() for _ in range(4)
+)
+_CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
 _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
 
@@ -183,7 +187,7 @@ def add_received_energy(g, received, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = has_arrived(received)
-    memory[_PERIOD] = T
+    memory[_STEP_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
     kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
@@ -191,7 +195,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
     filter_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
-    contact, load, filtered = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_FILTERED_LOAD]
+    contact, load, filtered = (
+        memory[_CONTACT_WRENCH],
+        memory[LOAD_WRENCH],
+        memory[_FILTERED_LOAD_WRENCH],
+    )
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
@@ -248,7 +256,11 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     kinetic = 0.5 * SLAVE_MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
-    free, missing, returned = ledger[g] - kinetic, hold - _master_level(g, received, memory), 0.0
+    free, missing, returned = (
+        ledger[g] - kinetic,
+        hold - _master_ledger_level(g, received, memory),
+        0.0,
+    )
     needed = missing
     if in_contact and speed < _SLAVE_REST_SPEED * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
@@ -269,7 +281,7 @@ def _servo_lag_s(p):
 
 
 @njit(cache=True)
-def _master_level(g, received, memory):
+def _master_ledger_level(g, received, memory):
     """Return the level of the master's ledger [J], with what is in transit to it."""
     return received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
 
@@ -284,7 +296,7 @@ def _max_displayed_stiffness(received, T, p, memory):
             p[MASTER_RESERVE][g],
         )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
-        level = min(max(_master_level(g, received, memory) / reserve, 0.0), 1.0)
+        level = min(max(_master_ledger_level(g, received, memory) / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
         _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
@@ -325,7 +337,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         memory[_DISPLACEMENT_FILTER_LAG] = inward
         memory[_FIT_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
         memory[_FIT_SAMPLE_LENGTH] = memory[_FIT_SPAN] = 0.0
-        memory[_STIFFNESS_SHARE] = memory[_SHARE_GOAL] = k_d / max(k, k_d)
+        memory[_STIFFNESS_SHARE] = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
     filtered_step = rate * (inward - memory[_DISPLACEMENT_FILTER_LAG])
     memory[_DISPLACEMENT_FILTER_LAG] += filtered_step - inward
     memory[_FIT_SAMPLE_LENGTH] += filtered_step
@@ -350,13 +362,18 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         memory[_FIT_SAMPLE_START_SPEED] = speed
     if k > 1.0:  # N/m
         rate, goal = min(T / _STIFFNESS_SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
-        if abs(goal - memory[_SHARE_GOAL]) > _STIFFNESS_SHARE_DEADBAND * memory[_SHARE_GOAL]:
-            memory[_SHARE_GOAL] = goal
-        memory[_STIFFNESS_SHARE] += rate * (memory[_SHARE_GOAL] - memory[_STIFFNESS_SHARE])
+        if (
+            abs(goal - memory[_STIFFNESS_SHARE_GOAL])
+            > _STIFFNESS_SHARE_DEADBAND * memory[_STIFFNESS_SHARE_GOAL]
+        ):
+            memory[_STIFFNESS_SHARE_GOAL] = goal
+        memory[_STIFFNESS_SHARE] += rate * (
+            memory[_STIFFNESS_SHARE_GOAL] - memory[_STIFFNESS_SHARE]
+        )
         depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
         if memory[IN_CONTACT] == 0.0:
-            memory[_SLAVE_DEPTH] = depth
-        memory[_SLAVE_DEPTH] += inward + rate * (depth - memory[_SLAVE_DEPTH] - inward)
+            memory[_SLAVE_WALL_DEPTH] = depth
+        memory[_SLAVE_WALL_DEPTH] += inward + rate * (depth - memory[_SLAVE_WALL_DEPTH] - inward)
         memory[IN_CONTACT] = 1.0
     explained = memory[_CONTACT_STIFFNESS] * inward
     explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED_INTO_WALL])
@@ -390,7 +407,7 @@ def _generate_command(received, connected, T, p, memory, error):
     velocity, normal, feed = memory[COMMAND_TWIST], memory[CONTACT_DIRECTION], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
-        beyond_wall = memory[_SLAVE_DEPTH] - work_along(normal, error)
+        beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
             compliance, inward_speed = 1.0 - memory[_STIFFNESS_SHARE], -work_along(normal, feed)
@@ -471,7 +488,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
         permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
-    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_STEP_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True

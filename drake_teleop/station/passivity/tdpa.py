@@ -52,7 +52,7 @@ from drake_teleop.station.passivity.packet import (
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _KEPT_HAND_INPUT_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_SLOW_ONSET_S = 0.1
+_SLOW_WRENCH_ONSET_S = 0.1
 _WRENCH_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
 _WRENCH_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
@@ -81,7 +81,7 @@ _layout = own_memory()
 _SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
-_CONTACT_STIFFNESS_ESTIMATE, _ONSET_PACKET = _layout.vector(2), _layout.vector(2)
+_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET = _layout.vector(2), _layout.vector(2)
 _LAST_COMMAND = _layout.vector(7)  # the command of the last step
 
 
@@ -252,15 +252,18 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
         round_trip = max(memory[STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
         lag = round_trip + p[SERVO_D][g] / p[SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _SLOW_ONSET_S, 1.0)
+        onset_rate = min(T / _SLOW_WRENCH_ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
         if size < _WRENCH_END_SHARE * filtered_size:
             rate = max(rate, onset_rate)
         else:
             if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
-                memory[_ONSET_PACKET][g] = memory[STEP_COUNT]
-            if lag > _SLOW_ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
+                memory[_QUICK_ONSET_PACKET][g] = memory[STEP_COUNT]
+            if (
+                lag > _SLOW_WRENCH_ONSET_S
+                and received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
+            ):
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]

@@ -50,7 +50,7 @@ _INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (
     _layout.vector(2),
     _layout.vector(2),
 )
-_DAMPING_PER_MISSING_ENERGY, MAX_ACCELERATION = _layout.vector(2), _layout.vector(2)
+_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
 _TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _layout = own_memory()
@@ -91,7 +91,7 @@ class TwoLayerConfig:
             self.level,
             self.capacity,
         )
-        p[_DAMPING_PER_MISSING_ENERGY], p[MAX_ACCELERATION] = self.damper, self.acceleration
+        p[_DAMPING_PER_MISSING_ENERGY], p[MAX_PORT_ACCELERATION] = self.damper, self.acceleration
 
 
 @njit(cache=True)
@@ -140,7 +140,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         drainable = min(T * p[_MAX_TANK_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if drained > drainable:
             scale_group(wrench, g, drainable / drained)
-        _limit_wrench_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
+        _limit_wrench_to_tank(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
@@ -162,16 +162,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         mass = p[SLAVE_MASS][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
         available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g], 0.0)
-        acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+        acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
         if _max_step_work(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(brake, g) / mass
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(brake, g) / mass
             available -= _max_step_work(brake, dx, g, acceleration, T)
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(spring, g) / mass
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(spring, g) / mass
             cost = _max_step_work(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
             _limit_wrench_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
