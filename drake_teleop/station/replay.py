@@ -125,8 +125,8 @@ def write_replay(
         scenario.description or "A run of the station",
         times,
         slow_motion,
-        readings=_displayed_numbers(signals),
-        shaded=contact_spans(result.t, contact),
+        displayed_numbers=_displayed_numbers(signals),
+        shaded_spans=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm a newton, as large as at the slave.",),
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )

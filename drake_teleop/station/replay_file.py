@@ -93,16 +93,16 @@ class ReplayFile:
     Args:
         times: (F,) times of the frames, evenly spaced, at least two [s].
         slow_motion: initial factor: seconds of replay per second of `times`.
-        readings: numbers that the page displays.
-        shaded: time spans (start, stop) that are shaded behind the curves.
+        displayed_numbers: numbers that the page displays.
+        shaded_spans: time spans (start, stop) that are shaded behind the curves.
         clock_label, curves_label: "{top}" in `curves_label` is replaced by the largest value.
     """
 
     title: str
     times: Array
     slow_motion: float
-    readings: Sequence[DisplayedNumber] = ()
-    shaded: Sequence[tuple[float, float]] = ()
+    displayed_numbers: Sequence[DisplayedNumber] = ()
+    shaded_spans: Sequence[tuple[float, float]] = ()
     notes: Sequence[str] = ()
     clock_label: str = "simulated time"
     curves_label: str = ""
@@ -150,8 +150,8 @@ class ReplayFile:
             "span": self._duration_s,
             "frames": len(self.times),
             "slow_motion": self.slow_motion,
-            "readings": [reading.data_for_page() for reading in self.readings],
-            "shaded": [(a - start, b - start) for a, b in self.shaded],
+            "readings": [reading.data_for_page() for reading in self.displayed_numbers],
+            "shaded": [(a - start, b - start) for a, b in self.shaded_spans],
             "notes": list(self.notes),
             "clock": self.clock_label,
             "curves": self.curves_label,

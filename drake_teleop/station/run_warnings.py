@@ -288,7 +288,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if found := find_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
-            f"contact chatter of the tool: {sum(chatter.num_touches for chatter in found)} touches at"
+            f"contact chatter of the tool: {sum(each.num_touches for each in found)} touches at"
             f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N (damp the touched object:"
             " dissipation of its surface or damping of its joint; or reduce"
             " force_scaling.force_scale or kinematic_scaling.translation_scale),",

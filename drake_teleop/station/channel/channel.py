@@ -121,8 +121,8 @@ _MOTION_SCALES = _layout.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
 _layout = SlotAllocator(PORTS_SIGNAL_SIZE)
-_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
-_SILENCE_TIMES, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
+_WORK_OF_HAND_WRENCH, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
+_SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
 _layout = SlotAllocator(7)
 _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
@@ -130,7 +130,7 @@ _RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
 # takes its step before the slave.
 _MIN_DELAY_STEPS = 1
-_NO_LOAD_WRENCH = np.zeros(6)
+_ZERO_LOAD_WRENCH = np.zeros(6)
 
 
 def initial_state_of_ends(
@@ -190,7 +190,7 @@ def step_channel(
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
         steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
-        ports[_WORK_OF_HAND], packet, wrench_received,
+        ports[_WORK_OF_HAND_WRENCH], packet, wrench_received,
     )  # fmt: skip
     network.send_packet(forward_parameters, forward, k, packet)
     _, fresh = network.receive_packet(forward_parameters, forward, k + 1, received)
@@ -199,8 +199,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
-    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -449,7 +449,7 @@ class TeleopChannel(LeafSystem):
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
         forward, backward = zip(state[:2], in_transit, strict=True)
-        load = _NO_LOAD_WRENCH
+        load = _ZERO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
         step_channel(
