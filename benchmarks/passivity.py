@@ -234,7 +234,7 @@ def cases() -> dict[str, tuple[str, Array]]:
         found[name] = name, method_parameters(PassivityConfig(method=name, **soft))
     tank = PassivityConfig(method="two_layer", **soft)
     found["two_layer_no_margin"] = "two_layer", method_parameters(tank)
-    found["two_layer_no_margin"][1][two_layer.MAX_ACCELERATION] = 0.0
+    found["two_layer_no_margin"][1][two_layer.MAX_PORT_ACCELERATION] = 0.0
     found["wave_hold"] = WAVE_HOLD, method_parameters(PassivityConfig(method="wave"))
     return found
 

@@ -274,7 +274,7 @@ def test_chatter_is_reported_with_rate_force_and_time(rate_hz, rest):
     (found,) = find_chatter(T, touching(rate_hz, 0.5, stop, rest=rest), np.empty(0))
     assert found.rate_hz == pytest.approx(rate_hz, rel=0.02)
     assert found.peak_force == pytest.approx(20.0, rel=0.02)
-    assert found.touches == pytest.approx((stop - 0.5) * rate_hz, abs=1.1)
+    assert found.num_touches == pytest.approx((stop - 0.5) * rate_hz, abs=1.1)
     assert (found.start, found.stop) == pytest.approx((0.5, stop), abs=1.05 / rate_hz + 2e-3)
 
 

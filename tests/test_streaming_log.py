@@ -50,7 +50,7 @@ rates: {sensor_hz: 2000, log_hz: 2000}
 
 @pytest.fixture(autouse=True)
 def _small_parts(monkeypatch):
-    monkeypatch.setattr(simulation, "_ROWS_PER_PART", 100)
+    monkeypatch.setattr(simulation, "_LOG_ROWS_PER_PART", 100)
 
 
 def run(**options) -> SimulationResult:

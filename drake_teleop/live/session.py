@@ -241,7 +241,7 @@ class Session:
         if wait_s:
             self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
-            self._on_disk.write_and_clear()
+            self._on_disk.write_and_clear_rows()
             self._on_disk.switch_simulator(station.simulator)
         else:
             self._earlier_rows.append(self._recorded_signals())
@@ -261,7 +261,7 @@ class Session:
             self._station.set_clutch(bool(self.inputs.clutch))
         self._advance_to(end)
         if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _ROWS_PER_LOG_PART:
-            self._on_disk.write_and_clear()
+            self._on_disk.write_and_clear_rows()
             self._rows_read = 0
 
     def _advance_to(self, ms: int) -> None:
@@ -309,7 +309,7 @@ class Session:
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
-            self._on_disk.write_and_keep()
+            self._on_disk.write_and_keep_rows()
             self._on_disk.wait_until_written()
 
     def _recorded_signals(self) -> SimulationResult:

@@ -58,7 +58,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _adapt_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _adapt_passivity_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             _contact_force_scale(scenario),
@@ -78,7 +78,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _adapt_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _adapt_passivity_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:

@@ -15,15 +15,15 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].
-_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
-REVERSAL_DELAY_S = 0.25
+_MIN_SWING_M, _MIN_SWING_RAD = 5e-4, np.deg2rad(0.5)
+MAX_REVERSAL_DELAY_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
-MAX_FORCE_RIPPLE_N = 0.05
+MAX_FORCE_RIPPLE_AT_REST_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
-_MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
+_MIN_OSCILLATION_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 # A touch begins where the force exceeds this share of the largest force within the time around it.
-_TOUCH_FORCE_SHARE, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
+_TOUCH_SHARE_OF_PEAK_FORCE, _PEAK_FORCE_WINDOW_S = 0.1, 0.1
 # Smallest time between two touches [s]; closer ones are bounces of one touch-down.
 _MIN_TOUCH_INTERVAL_S = 0.005
 # Largest time between two touches of a series [s]: 5 Hz.
@@ -31,7 +31,7 @@ _MAX_TOUCH_INTERVAL_S = 0.2
 # Smallest number of touches, duration [s] and force [N] of a series.
 _MIN_CHATTER_TOUCHES, _MIN_CHATTER_DURATION_S, _MIN_CHATTER_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].
-_MAX_TIME_TO_REVERSAL_S = 0.1
+_MAX_TOUCH_TO_REVERSAL_S = 0.1
 
 
 def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
@@ -53,7 +53,7 @@ def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
 
 
 def flag_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_DELAY_S
+    t: Array, command: Array, actual: Array, swing: float, near: float = MAX_REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
@@ -67,9 +67,9 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_explained_times(t[reversal_indices(x, swing)], commanded, near)
-        for series in split_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
-            if len(series) >= _MIN_REVERSALS:
+        times = remove_times_near_causes(t[reversal_indices(x, swing)], commanded, near)
+        for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
+            if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
     return oscillating
 
@@ -82,14 +82,14 @@ def flag_unexplained_pose_oscillation(
     `near` [s] is that of `flag_unexplained_oscillation`.
     """
     turned, wanted = (quaternions_as_angles(pose, command) for pose in (actual, command))
-    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
-    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
+    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, near)
+    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_SWING_RAD, near)
 
 
 def pose_reversal_times(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
-    rows = [reversal_indices(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
-    rows += [reversal_indices(x, _MIN_AMPLITUDE_RAD) for x in quaternions_as_angles(pose, pose).T]
+    rows = [reversal_indices(x, _MIN_SWING_M) for x in pose[:, 4:].T]
+    rows += [reversal_indices(x, _MIN_SWING_RAD) for x in quaternions_as_angles(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
@@ -102,7 +102,7 @@ def quaternions_as_angles(pose: Array, reference: Array) -> Array:
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_explained_times(times: Array, causes: Array, near: float) -> Array:
+def remove_times_near_causes(times: Array, causes: Array, near: float) -> Array:
     """Remove, for each cause, the nearest event within `near` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -111,7 +111,7 @@ def remove_explained_times(times: Array, causes: Array, near: float) -> Array:
     return times
 
 
-def split_at_gaps(times: Array, longest: float) -> list[Array]:
+def split_times_at_gaps(times: Array, longest: float) -> list[Array]:
     """Split sorted times [s] where two are more than `longest` [s] apart."""
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
@@ -125,7 +125,7 @@ def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
 class Chatter(NamedTuple):
     """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
 
-    touches: int
+    num_touches: int
     rate_hz: float
     peak_force: float
     start: float
@@ -142,9 +142,9 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
         force: (N,) magnitude of the contact force [N].
         reversals: times of the command's reversals [s].
     """
-    touches = remove_explained_times(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
+    touches = remove_times_near_causes(_find_touches(t, force), reversals, _MAX_TOUCH_TO_REVERSAL_S)
     found = []
-    for series in split_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
+    for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:
             continue
         start, stop = float(series[0]), float(series[-1])
@@ -159,6 +159,6 @@ def _find_touches(t: Array, force: Array) -> Array:
     if len(t) < 2:
         return np.empty(0)
     rows = 2 * round(_PEAK_FORCE_WINDOW_S / (t[1] - t[0])) + 1
-    least = _TOUCH_FORCE_SHARE * maximum_filter1d(force, rows)[1:]
+    least = _TOUCH_SHARE_OF_PEAK_FORCE * maximum_filter1d(force, rows)[1:]
     starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
     return starts[np.diff(starts, prepend=-np.inf) >= _MIN_TOUCH_INTERVAL_S]

@@ -59,7 +59,7 @@ _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
 _GRIP_P_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
+_ARM_WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W = np.array([-0.06, 0.0, 0.0])
@@ -125,8 +125,8 @@ def write_replay(
         scenario.description or "A run of the station",
         times,
         slow_motion,
-        readings=_displayed_numbers(signals),
-        shaded=contact_spans(result.t, contact),
+        displayed_numbers=_displayed_numbers(signals),
+        shaded_spans=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm a newton, as large as at the slave.",),
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
@@ -287,7 +287,7 @@ class ReplayScene:
     def _arrow_positions_W(self) -> dict[str, Array]:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _WRIST_P_S + _WRIST_ARROW_OFFSET_W,
+            "wrist": X_WS @ _ARM_WRIST_P_S + _WRIST_ARROW_OFFSET_W,
             "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
         }
         if self._master is not None:

@@ -37,8 +37,8 @@ _MAX_FRAMES = 2000
 _MIN_REPLAY_DURATION_S = 6.0  # shortest replay with the default speed [s]
 _SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # slow-motion factors of the player
 
-_SHAFT_RADIUS_M, _HEAD_LENGTH_M = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
-_ARROW_M_PER_N = 0.003
+_ARROW_RADIUS_M, _ARROW_HEAD_M = 0.006, 0.03  # of the shaft; length
+_ARROW_LENGTH_M_PER_N = 0.003
 _DEFAULT_SHAPE_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
 _HALF_TURN_ABOUT_X = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
@@ -93,16 +93,16 @@ class ReplayFile:
     Args:
         times: (F,) times of the frames, evenly spaced, at least two [s].
         slow_motion: initial factor: seconds of replay per second of `times`.
-        readings: numbers that the page displays.
-        shaded: time spans (start, stop) that are shaded behind the curves.
+        displayed_numbers: numbers that the page displays.
+        shaded_spans: time spans (start, stop) that are shaded behind the curves.
         clock_label, curves_label: "{top}" in `curves_label` is replaced by the largest value.
     """
 
     title: str
     times: Array
     slow_motion: float
-    readings: Sequence[DisplayedNumber] = ()
-    shaded: Sequence[tuple[float, float]] = ()
+    displayed_numbers: Sequence[DisplayedNumber] = ()
+    shaded_spans: Sequence[tuple[float, float]] = ()
     notes: Sequence[str] = ()
     clock_label: str = "simulated time"
     curves_label: str = ""
@@ -150,8 +150,8 @@ class ReplayFile:
             "span": self._duration_s,
             "frames": len(self.times),
             "slow_motion": self.slow_motion,
-            "readings": [reading.data_for_page() for reading in self.readings],
-            "shaded": [(a - start, b - start) for a, b in self.shaded],
+            "readings": [reading.data_for_page() for reading in self.displayed_numbers],
+            "shaded": [(a - start, b - start) for a, b in self.shaded_spans],
             "notes": list(self.notes),
             "clock": self.clock_label,
             "curves": self.curves_label,
@@ -212,25 +212,25 @@ class ForceArrow:
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
         self._path = f"/forces/{name}"
         meshcat.SetObject(
-            f"{self._path}/shaft/scaled", Cylinder(_SHAFT_RADIUS_M, 1.0), colour_to_rgba(colour)
+            f"{self._path}/shaft/scaled", Cylinder(_ARROW_RADIUS_M, 1.0), colour_to_rgba(colour)
         )
         # The cone's tip is at its origin; its axis is z.
-        head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
+        head = MeshcatCone(_ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
 
     def show_force(self, canvas: Canvas, replay_time: float, place: Array, force: Array) -> None:
         """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `replay_time` [s]."""
-        length = _ARROW_M_PER_N * float(np.linalg.norm(force))
-        shaft = max(length - _HEAD_LENGTH_M, 1e-3)
+        length = _ARROW_LENGTH_M_PER_N * float(np.linalg.norm(force))
+        shaft = max(length - _ARROW_HEAD_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
-        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
+        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _ARROW_HEAD_M) * R[:, 2]
         back = along @ _HALF_TURN_ABOUT_X
         put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), replay_time)
         put(f"{self._path}/head", RigidTransform(back, tip), replay_time)
         scale = canvas.SetProperty
-        size = min(1.0, length / _HEAD_LENGTH_M)
+        size = min(1.0, length / _ARROW_HEAD_M)
         scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], replay_time)
         scale(f"{self._path}/head/scaled", "scale", [size, size, size], replay_time)
 

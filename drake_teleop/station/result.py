@@ -34,7 +34,7 @@ _SIGNAL_METADATA_KEY = "drake_teleop.signals"
 # Longer curves are drawn as minimum and maximum of blocks.
 _MAX_CURVE_POINTS = 20_000
 # Columns of the canonical log (README, "Logs") for each signal.
-_LOG_COLUMNS_OF_SIGNAL = {
+_SENSOR_LOG_COLUMNS_OF_SIGNAL = {
     "sample_time": ("t",),
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
     "specific_force_S": ("s_x", "s_y", "s_z"),
@@ -222,7 +222,7 @@ class SimulationResult:
         """
         import polars as pl
 
-        missing = [name for name in _LOG_COLUMNS_OF_SIGNAL if name not in self]
+        missing = [name for name in _SENSOR_LOG_COLUMNS_OF_SIGNAL if name not in self]
         if missing:
             raise DrakeTeleopError(
                 f"the result contains no {', '.join(missing)} (a sensor log needs these signals)",
@@ -230,7 +230,7 @@ class SimulationResult:
                 remedy="record the wrist sensor's signals",
             )
         columns: dict[str, NDArray[np.float64]] = {}
-        for name, names in _LOG_COLUMNS_OF_SIGNAL.items():
+        for name, names in _SENSOR_LOG_COLUMNS_OF_SIGNAL.items():
             columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
@@ -316,7 +316,7 @@ class SimulationResult:
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_reduce_curve(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_curve_extremes(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -383,7 +383,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         return len(self._columns)
 
 
-def _reduce_curve(
+def _curve_extremes(
     t: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     length = 2 * len(t) // _MAX_CURVE_POINTS

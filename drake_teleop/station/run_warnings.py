@@ -17,8 +17,8 @@ from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wre
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
-    MAX_FORCE_RIPPLE_N,
-    REVERSAL_DELAY_S,
+    MAX_FORCE_RIPPLE_AT_REST_N,
+    MAX_REVERSAL_DELAY_S,
     find_chatter,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
@@ -38,27 +38,31 @@ Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
 Warnings = Iterator[tuple[str, Spans]]
 
-_MIN_SPAN_S = 0.2
+_MIN_WARNING_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
 # Gaps between time spans that are shorter are closed [s].
-_MAX_CLOSED_GAP_S = 0.05
+_MAX_CLOSED_SPAN_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
 _SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
-_MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
+_MIN_COMMAND_LAG_M, _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = (
+    2e-3,
+    np.deg2rad(1.0),
+    np.deg2rad(0.2),
+)
 # Settling time of the command of `ledger` with sufficient energy [s].
-_LEDGER_SETTLING_S = 0.05
+_LEDGER_COMMAND_SETTLING_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
-_MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
+_MIN_JOINT_OSCILLATION_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
-_NUM_SETTLING_TIME_CONSTANTS = 6.0
+_NUM_POSITION_LOOP_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
-_MIN_REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
+_MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
-_MIN_OSCILLATION_CYCLES = 4
+_MIN_FORCE_OSCILLATION_CYCLES = 4
 # Largest number of time spans that a warning lists; further ones are counted.
-_MAX_LISTED_TIMES = 3
+_MAX_LISTED_SPANS = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
@@ -89,7 +93,7 @@ def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
     """
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
-        if spans and start - spans[-1][1] < _MAX_CLOSED_GAP_S:
+        if spans and start - spans[-1][1] < _MAX_CLOSED_SPAN_GAP_S:
             start = spans.pop()[0]
         spans.append((start, stop))
     return [(start, stop) for start, stop in spans if stop - start >= least]
@@ -102,8 +106,8 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     times [s], `command` and `actual` are (N, k).
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
-    above = actual - _running_maximum(command, rows)
-    below = -_running_maximum(-command, rows) - actual
+    above = actual - _maximum_of_last_rows(command, rows)
+    below = -_maximum_of_last_rows(-command, rows) - actual
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
 
 
@@ -149,7 +153,7 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
-        spans = find_spans(t, full, _MIN_SPAN_S)
+        spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans
         ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
@@ -166,15 +170,15 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
-        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_SPAN_S)
+        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S)
         yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
-    for command, actual, least, unit, scale in _position_and_rotation_parts(sent, received):
+    for command, actual, least, unit, scale in _pose_parts_with_lag_limits(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
-        spans = find_spans(t, lag > least, _MIN_SPAN_S)
+        spans = find_spans(t, lag > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
@@ -182,8 +186,10 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
             spans,
         )
     yield from _check_reserve_speed_limit(result, scenario)
-    oscillating = flag_unexplained_pose_oscillation(t, sent, received, REVERSAL_DELAY_S + window)
-    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    oscillating = flag_unexplained_pose_oscillation(
+        t, sent, received, MAX_REVERSAL_DELAY_S + window
+    )
+    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
@@ -196,15 +202,17 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
     mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
     limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
     then = t - _newest_packet_ages_s(t, scenario)
-    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_S
-    parts = _position_and_rotation_parts(sent, received)
+    window = (
+        longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_COMMAND_SETTLING_S
+    )
+    parts = _pose_parts_with_lag_limits(sent, received)
     for g, (command, actual, least, unit, scale) in enumerate(parts):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_S)
+        far = lag_beyond_delay(t, asked, actual, _LEDGER_COMMAND_SETTLING_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
-        speed = _running_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
+        speed = _maximum_of_last_rows(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
-        if held.sum() * row < _MIN_SPAN_S:
+        if held.sum() * row < _MIN_WARNING_SPAN_S:
             continue
         enough, speed_unit = np.array(config.reserve), ("m/s", "rad/s")[g]
         enough[g] *= (speed[held].max() / limit[g]) ** 2
@@ -220,13 +228,13 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         )
 
 
-def _position_and_rotation_parts(
+def _pose_parts_with_lag_limits(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
     wanted, turned = (quaternions_as_angles(pose, command) for pose in (command, actual))
     return (
-        (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
-        (wanted, turned, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
+        (command[:, 4:], actual[:, 4:], _MIN_COMMAND_LAG_M, "mm", 1e3),
+        (wanted, turned, _MIN_COMMAND_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     )
 
 
@@ -246,26 +254,28 @@ def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: Arm
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window = _NUM_POSITION_LOOP_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
-        spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_SPAN_S)
+        spans = find_spans(
+            t, far > (_MIN_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_WARNING_SPAN_S
+        )
         largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
-    oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
-    spans = find_spans(t, oscillating, _MIN_SPAN_S)
+    oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_OSCILLATION_RAD)
+    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
     yield "the slave oscillates while its command does not,", spans
 
 
 def _check_hand_oscillation(result: SimulationResult) -> Warnings:
     if "intent" in result and "pose_master" in result:
         oscillating = flag_unexplained_pose_oscillation(
-            result.t, result["intent"], result["pose_master"], REVERSAL_DELAY_S
+            result.t, result["intent"], result["pose_master"], MAX_REVERSAL_DELAY_S
         )
-        spans = find_spans(result.t, oscillating, _MIN_SPAN_S)
+        spans = find_spans(result.t, oscillating, _MIN_WARNING_SPAN_S)
         yield "the hand oscillates while its intent does not,", spans
 
 
@@ -278,7 +288,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
     if found := find_chatter(result.t, force, reversals):
         worst = max(found, key=lambda chatter: chatter.peak_force)
         yield (
-            f"contact chatter of the tool: {sum(chatter.touches for chatter in found)} touches at"
+            f"contact chatter of the tool: {sum(each.num_touches for each in found)} touches at"
             f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N (damp the touched object:"
             " dissipation of its surface or damping of its joint; or reduce"
             " force_scaling.force_scale or kinematic_scaling.translation_scale),",
@@ -291,19 +301,19 @@ def _check_rendered_force(result: SimulationResult) -> Warnings:
         return
     t, intent = result.t, result["intent"][:, 4:]
     force = high_pass_above_5_hz(t, result["force_to_master"][:, :3])
-    rows = round(_MIN_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
-    largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
-    rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
+    rows = round(_MIN_INTENT_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
+    largest, least = _maximum_of_last_rows(intent, rows), -_maximum_of_last_rows(-intent, rows)
+    rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_N), _MIN_SPAN_S)
+    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_AT_REST_N), _MIN_WARNING_SPAN_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
     part = force[(t >= start) & (t <= stop)]
     strongest = part[:, part.std(axis=0).argmax()]
     crossings = np.count_nonzero(np.diff(np.signbit(strongest)))
-    if crossings < 2 * _MIN_OSCILLATION_CYCLES:  # a step is no oscillation
+    if crossings < 2 * _MIN_FORCE_OSCILLATION_CYCLES:  # a step is no oscillation
         return
     yield (
         f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
@@ -329,7 +339,7 @@ def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -
     return full
 
 
-def _running_maximum(x: Array, rows: int) -> Array:
+def _maximum_of_last_rows(x: Array, rows: int) -> Array:
     largest, done = x.copy(), 1
     while done < min(rows, len(x)):
         step = min(done, rows - done)
@@ -345,9 +355,9 @@ def _maximum_within_spans(t: Array, values: Array, spans: Spans) -> float:
 def _spans_text(spans: Spans) -> str:
     listed = [
         f"from {start:.3f} to {stop:.3f} s" if stop > start else f"at {start:.3f} s"
-        for start, stop in spans[:_MAX_LISTED_TIMES]
+        for start, stop in spans[:_MAX_LISTED_SPANS]
     ]
-    more = len(spans) - _MAX_LISTED_TIMES
+    more = len(spans) - _MAX_LISTED_SPANS
     if more > 0:
         listed.append(f"{more} more time{'s' if more > 1 else ''}")
     return " and ".join([", ".join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)

@@ -30,7 +30,7 @@ def _joint_names(joints: int) -> str:
     return " ".join(f"joint_{i + 1}" for i in range(joints))
 
 
-_STATE, _STATE_UNITS = _state_components_and_units(6)
+_STATE_AXES, _STATE_UNITS = _state_components_and_units(6)
 _JOINTS = _joint_names(6)
 # Signals with one component per joint.
 _JOINT_SIGNAL_NAMES = ("joint_position", "joint_torque", "joint_command")
@@ -70,7 +70,7 @@ SIGNALS = {
             "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
             "offsets and phi, Eq. (7)",
         ),
-        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities, at t"),
+        _signal("slave_state", _STATE_AXES, _STATE_UNITS, "true joint angles and velocities, at t"),
         _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
         _signal(
             "load_state",
@@ -86,7 +86,9 @@ SIGNALS = {
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
         _signal("intent", *_POSE_AXES_AND_UNITS, "intended pose of the stylus, X_BE"),
         _signal("hand_wrench_E", *_WRENCH_AXES_AND_UNITS, "hand on the stylus at Eo, in B"),
-        _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
+        _signal(
+            "master_state", _STATE_AXES, _STATE_UNITS, "joint angles and velocities of the device"
+        ),
         _signal("pose_master", *_POSE_AXES_AND_UNITS, "of the stylus, X_BE"),
         _signal("twist_master", *_TWIST_AXES_AND_UNITS, "of the stylus in the device's base"),
         _signal("pose_command", *_POSE_AXES_AND_UNITS, "setpoint of the slave, X_WS"),

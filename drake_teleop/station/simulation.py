@@ -24,7 +24,7 @@ from drake_teleop.station.signals import LOG_BLOCK_NAME, signal_of
 # Interval of progress updates [ms].
 _PROGRESS_INTERVAL_MS = 20
 # Rows of a part of a log on disk: some seconds, some MB.
-_ROWS_PER_PART = 8192
+_LOG_ROWS_PER_PART = 8192
 
 
 def simulate(
@@ -73,8 +73,8 @@ def simulate(
             advance_without_garbage_collection(simulator, time)
             if stops:
                 rows = _raise_recorded_fault(simulator, simulation.settle, rows)
-            if on_disk is not None and on_disk.num_unwritten_rows() >= _ROWS_PER_PART:
-                on_disk.write_and_clear()
+            if on_disk is not None and on_disk.num_unwritten_rows() >= _LOG_ROWS_PER_PART:
+                on_disk.write_and_clear_rows()
                 rows = 0
             over = simulation.end_with_task and _task_is_over(simulator)
             progress(1.0 if over else time / end)
@@ -82,7 +82,7 @@ def simulate(
                 break
     finally:
         if on_disk is not None:
-            on_disk.write_and_clear()
+            on_disk.write_and_clear_rows()
     if log is not None:
         return SimulationResult.scan_parquet(log)
     return read_recorded_signals(simulator, simulation.settle)
@@ -148,14 +148,14 @@ class LogOnDisk:
     def num_unwritten_rows(self) -> int:
         return int(self._sink.num_samples())
 
-    def write_and_clear(self) -> None:
+    def write_and_clear_rows(self) -> None:
         """Write the rows in memory as the next part and clear them; safe to repeat."""
         part = self._read_rows()
         self._write_part(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
-    def write_and_keep(self) -> None:
+    def write_and_keep_rows(self) -> None:
         """Write the rows in memory but keep them; a later part replaces them."""
         self._write_part(self._read_rows())
 

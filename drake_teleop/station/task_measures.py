@@ -27,7 +27,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_FLOOR_TOLERANCE_M = 2e-3  # m
+_SLOT_FLOOR_TOLERANCE_M = 2e-3  # m
 _PHASE_TEXTS = {
     PHASE_MOVING: "moving to the target",
     PHASE_APPROACHING: "approaching the contact",
@@ -56,8 +56,8 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     force = contact_force(result)
     held = np.empty(0)
     if done and isinstance(task, Press):
-        held = _forces_during_hold(t, force, task, ended)
-    wanted = _required_force(task)
+        held = _contact_forces_during_hold(t, force, task, ended)
+    wanted = _required_contact_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, CONTACT_PERCEIVED_INDEX] > 0.0, force[span] > 0.0
@@ -115,7 +115,7 @@ def _last_row_of_task(result: SimulationResult) -> int:
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
 
-def _required_force(task: Task) -> float:
+def _required_contact_force(task: Task) -> float:
     if isinstance(task, Press):
         return task.force
     return task.push if isinstance(task, Insert) else 0.0
@@ -142,14 +142,14 @@ def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.boo
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 
 
-def _forces_during_hold(t: Array, force: Array, task: Press, ended: int) -> Array:
+def _contact_forces_during_hold(t: Array, force: Array, task: Press, ended: int) -> Array:
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
     force = contact_force(result)
     if isinstance(task, Press):
-        held = float(_forces_during_hold(result.t, force, task, ended).mean())
+        held = float(_contact_forces_during_hold(result.t, force, task, ended).mean())
         if abs(held - task.force) <= task.tolerance:
             return ""
         return f"the tool pressed with {held:.2f} N, not {task.force:g} ± {task.tolerance:g} N"
@@ -159,7 +159,7 @@ def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, 
     if isinstance(task, Insert):
         above = off[2] + task.depth
         wrong = f"the tip is {1e3 * above:.1f} mm above the floor"
-        return "" if above <= _FLOOR_TOLERANCE_M else wrong
+        return "" if above <= _SLOT_FLOOR_TOLERANCE_M else wrong
     away = float(np.linalg.norm(off))
     if isinstance(task, Touch):
         return f"the tool touches nothing, the tip {1e3 * away:.1f} mm from the target"
@@ -175,7 +175,9 @@ def _force_and_position_text(
     place = f"the tip {away:.1f} mm from the target"
     if isinstance(task, Reach):
         return place
-    wanted = f" instead of {_required_force(task):g} N" if _required_force(task) else ""
+    wanted = (
+        f" instead of {_required_contact_force(task):g} N" if _required_contact_force(task) else ""
+    )
     return f"{place}, {contact_force(result)[ended]:.1f} N at the tool{wanted}"
 
 

@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
 from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.channel_side import MakeChannel, _adapt_to_device
+from drake_teleop.station.channel_side import MakeChannel, _adapt_passivity_to_device
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.memory import LAST_WRENCH, LOAD_WRENCH
@@ -39,7 +39,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.peak_force, min(device.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _adapt_to_device(scenario, own)
+    limited = _adapt_passivity_to_device(scenario, own)
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -51,12 +51,12 @@ def test_ledger_knows_the_encoder_steps_of_the_device():
     steps = {}
     for model in ("phantom_premium_15", "omega_6", "geomagic_touch"):
         scenario.master.model = model
-        steps[model] = _adapt_to_device(scenario, PassivityConfig()).ledger.encoder_step
+        steps[model] = _adapt_passivity_to_device(scenario, PassivityConfig()).ledger.encoder_step
     assert steps["phantom_premium_15"] == [0.0, 0.0]
     np.testing.assert_allclose(steps["omega_6"], [1e-5, np.radians(0.09)])
     assert steps["geomagic_touch"][0] == pytest.approx(5.5e-5, rel=0.02)
     own = PassivityConfig(ledger=LedgerConfig(encoder_step=[2e-4, 1e-3]))
-    assert _adapt_to_device(scenario, own).ledger.encoder_step == [2e-4, 1e-3]
+    assert _adapt_passivity_to_device(scenario, own).ledger.encoder_step == [2e-4, 1e-3]
 
 
 def moving(**changes: object) -> Scenario:

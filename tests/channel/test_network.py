@@ -18,7 +18,7 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import (
     BACKWARD,
     FORWARD,
-    MAX_EXTRAPOLATION_S,
+    MAX_POSE_EXTRAPOLATION_S,
     PRESETS,
     NetworkConfig,
     initial_network_state,
@@ -28,7 +28,7 @@ from drake_teleop.station.channel.network import (
     send_packet,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     INTEGRAL,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
@@ -427,17 +427,17 @@ def test_silence(silence, silent):
     if silent and silence == "zero":
         expected[VELOCITY] = expected[WRENCH] = expected[PACKET_LOAD_WRENCH] = 0.0
     if silent and silence == "extrapolate":
-        time = min(silent * PERIOD, MAX_EXTRAPOLATION_S)
+        time = min(silent * PERIOD, MAX_POSE_EXTRAPOLATION_S)
         v, w = packet[VELOCITY][:3], packet[VELOCITY][3:]
         expected[POSE][:4] = quaternion_product(
             quaternion_exponential(tuple(w * time)), tuple(packet[POSE][:4])
         )
         expected[POSE][4:] += v * time
-        if silent * PERIOD > MAX_EXTRAPOLATION_S:
+        if silent * PERIOD > MAX_POSE_EXTRAPOLATION_S:
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
     # Whatever the policy, counters and integrals stand still: silence brings no energy.
-    for part in (INTEGRAL, slice(ENERGY.start, PACKET_LOAD_WRENCH.start)):
+    for part in (INTEGRAL, slice(CUMULATIVE_ENERGY.start, PACKET_LOAD_WRENCH.start)):
         np.testing.assert_array_equal(received[part], packet[part])
 
 

@@ -154,7 +154,7 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
             forward_kinematics(slave.arm.table, q, R, p)
             np.testing.assert_allclose(frames[-1].translation(), p, atol=1e-9)
             np.testing.assert_allclose(frames[-1].rotation().matrix(), R, atol=1e-9)
-        force, speed = film.readings
+        force, speed = film.displayed_numbers
         assert force.values.max() < slave.limits.max_sensor_norms[0]
         assert speed.values[0] < 0.05 < speed.values.max()
         assert film.slow_motion == 1.0

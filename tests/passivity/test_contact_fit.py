@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.passivity.contact_fit import (
-    NUM_FIT_SUMS,
+    NUM_CONTACT_FIT_SUMS,
     force_change_by_slip,
     update_contact_fit,
 )
 
 
 def found(stiffness, damping, way, faster, keep=0.8):
-    sums, values = np.zeros(NUM_FIT_SUMS), (0.0, 0.0)
+    sums, values = np.zeros(NUM_CONTACT_FIT_SUMS), (0.0, 0.0)
     for dx, dv in zip(way, faster, strict=True):
         values = update_contact_fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
     return values
@@ -34,7 +34,7 @@ def test_proportional_speed_is_stiffness_and_old_stretches_fade():
     k, b = found(300.0, 17.0, way, 10.0 * way)
     assert b <= 17.0 and k + 10.0 * b == pytest.approx(470.0, rel=0.02)
     assert found(300.0, 17.0, way[:1], 10.0 * way[:1]) == (pytest.approx(470.0), 0.0)
-    sums = np.zeros(NUM_FIT_SUMS)
+    sums = np.zeros(NUM_CONTACT_FIT_SUMS)
     for stiffness in (2000.0, 100.0):
         for step in 2e-4 * np.array([1.0, -1.0, 2.0, -1.0, 1.0, 2.0] * 4):
             k, _ = update_contact_fit(sums, stiffness * step, step, 0.0, 0.5)
@@ -42,7 +42,7 @@ def test_proportional_speed_is_stiffness_and_old_stretches_fade():
 
 
 def test_stiffness_and_damping_are_not_negative():
-    assert update_contact_fit(np.zeros(NUM_FIT_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
+    assert update_contact_fit(np.zeros(NUM_CONTACT_FIT_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
         0.0,
         pytest.approx(0.0, abs=1e-9),
     )

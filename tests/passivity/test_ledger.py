@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.ledger_slave import _MOTOR_ENERGY
+from drake_teleop.station.passivity.ledger_slave import _AVAILABLE_MOTOR_ENERGY
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     RECEIVED_ENERGY,
@@ -181,7 +181,7 @@ def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
         PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
     )  # fmt: skip
     moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])
-    np.testing.assert_allclose(memory[_MOTOR_ENERGY], held - moving, rtol=1e-12)
+    np.testing.assert_allclose(memory[_AVAILABLE_MOTOR_ENERGY], held - moving, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [4, 38])

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.passivity.ledger import (
-    _FRICTION_RESIDUAL,
     _MODEL_FRICTION_AT_HAND,
     _MODEL_FRICTION_AT_SLAVE,
+    _UNMODELLED_FRICTION,
     LedgerConfig,
 )
 from drake_teleop.station.passivity.ledger_slave import (
     _CONTACT_DAMPING,
     _CONTACT_STIFFNESS,
-    _DISPLAYED_FORCE,
-    _LAST_INWARD_SPEED,
+    _LAST_SPEED_INTO_WALL,
+    _RENDERED_FORCE,
     CONTACT_DIRECTION,
-    CONTACT_STIFFNESS,
     ENCODER_STEP,
+    FILTERED_OWN_VELOCITY,
     IN_CONTACT,
-    LEDGER_LEVEL,
-    OWN_VELOCITY,
+    PACKET_CONTACT_STIFFNESS,
+    PACKET_LEDGER_LEVEL,
     ROUND_TRIP,
     _is_wall_removed,
     update_contact_direction,
@@ -50,7 +50,7 @@ from drake_teleop.station.passivity.methods import (
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
-    MAX_WRENCH_RATE,
+    MAX_HAND_WRENCH_RATE,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     PACKET_SIZE,
@@ -75,7 +75,7 @@ class Hand:
         self.memory[STORED_ENERGY] = 0.2  # more than it needs, and no more than it keeps in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
         self.packet[POSE], self.packet[WRENCH] = START, wrench
-        self.packet[CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
+        self.packet[PACKET_CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
 
     def step(self, dx: np.ndarray | None = None) -> np.ndarray:
         """Moves by dx (6,), translation and small turn; what it feels then."""
@@ -227,7 +227,7 @@ def test_friction_stays_across_the_direction_as_it_turns():
         hand.packet[POSE][4:] += 1e-6 * rng.normal(size=3)
         felt = hand.step(rng.normal(size=6) * np.repeat([1e-6, 1e-5], 3))
         normal = hand.memory[CONTACT_DIRECTION]
-        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _FRICTION_RESIDUAL):
+        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             assert abs(wrench_component_along(hand.memory[friction], normal, hand.p)) < 1e-12
         pressed = wrench_component_along(hand.packet[WRENCH], normal, hand.p)
         assert wrench_component_along(felt, normal, hand.p) == pytest.approx(pressed, abs=1e-9)
@@ -406,7 +406,7 @@ def test_slave_counts_energy_in_transit_to_the_hand(stale_level):
     """The master's packets tell for 3 s nothing new: they do not contain what is on the way."""
     p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
-    received[POSE], received[LEDGER_LEVEL] = START, stale_level
+    received[POSE], received[PACKET_LEDGER_LEVEL] = START, stale_level
     wrench, still = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), np.zeros(6)
     memory[STORED_ENERGY], sent = 2.0, []
     for _ in range(3000):
@@ -428,7 +428,7 @@ def test_level_in_the_packet_of_the_hand_excludes_received_energy(received):
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ENERGY] = received
     hand.rest(1500)
-    levels = hand.sent[LEDGER_LEVEL] + hand.memory[RECEIVED_ENERGY]
+    levels = hand.sent[PACKET_LEDGER_LEVEL] + hand.memory[RECEIVED_ENERGY]
     np.testing.assert_allclose(levels, hand.memory[STORED_ENERGY])
     np.testing.assert_allclose(hand.memory[RECEIVED_ENERGY], received)
 
@@ -448,10 +448,10 @@ def test_wrench_cross_fades_after_missing_packets():
     hand.packet[WRENCH][2] = 3.0
     hand.packet[PACKET_NUMBER] += 3.0
     course = [hand.step()[2] for _ in range(10)]
-    assert course[0] == pytest.approx(1.0 + MAX_WRENCH_RATE[0] * T)
-    assert np.diff(course).max() <= MAX_WRENCH_RATE[0] * T + 1e-12 and course[-1] == pytest.approx(
-        3.0
-    )
+    assert course[0] == pytest.approx(1.0 + MAX_HAND_WRENCH_RATE[0] * T)
+    assert np.diff(course).max() <= MAX_HAND_WRENCH_RATE[0] * T + 1e-12 and course[
+        -1
+    ] == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("shown", [0.25, 0.5, 4.0, 30.0])
@@ -462,8 +462,8 @@ def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
 ):
     memory = initial_method_memory("ledger", method_parameters(RICH), START)
     normal = np.array([0.6, 0.0, -0.8, 0.0, 0.0, 0.0])
-    memory[CONTACT_DIRECTION], memory[OWN_VELOCITY] = normal, -speeds[0] * normal
-    memory[_LAST_INWARD_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
+    memory[CONTACT_DIRECTION], memory[FILTERED_OWN_VELOCITY] = normal, -speeds[0] * normal
+    memory[_LAST_SPEED_INTO_WALL], memory[_RENDERED_FORCE] = speeds[1], shown
     memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = stiffness, damping
     explained = stiffness * abs(step) + damping * abs(speeds[1] - speeds[0])
     removed = _is_wall_removed(step * normal, memory)
@@ -475,7 +475,7 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
     p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
     pose, before = START.copy(), START.copy()
-    received[POSE], received[LEDGER_LEVEL] = START, 1.0
+    received[POSE], received[PACKET_LEDGER_LEVEL] = START, 1.0
     for k in range(3000):
         t = k * T
         pose[4:] = 2e-3 * np.sin(40.0 * t), 0.0, -0.01 * min(t, 1.0) - 1e-4 * np.sin(31.0 * t)
@@ -491,7 +491,7 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
             command, packet,
         )  # fmt: skip
         before[:] = pose
-    assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
+    assert 180.0 < packet[PACKET_CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
 
 
 def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
@@ -501,7 +501,7 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
     """
     p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
-    pose, received[POSE], received[LEDGER_LEVEL] = START.copy(), START, 1.0
+    pose, received[POSE], received[PACKET_LEDGER_LEVEL] = START.copy(), START, 1.0
     hand, felt = Hand(np.zeros(6), 0.0), []
     for k in range(2600):
         depth = 2e-2 * min(k / 1000, 1.0)
@@ -567,7 +567,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
     np.testing.assert_allclose(
         memory[CONTACT_DIRECTION], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12
     )
-    stiffness = packet[CONTACT_STIFFNESS]
+    stiffness = packet[PACKET_CONTACT_STIFFNESS]
     assert stiffness == pytest.approx(200.0, rel=0.05)
     # The packets take what is passed on to the hand, which has nothing here.
     books = (

@@ -39,15 +39,15 @@ from drake_teleop.station.passivity.methods import (
     step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
-    INPUTS_FINITE,
+    CUMULATIVE_ENERGY,
     PACKET_NUMBER,
     PACKET_SIZE,
+    SENDER_INPUTS_FINITE,
     WRENCH,
     move_pose_into,
     pose_difference_into,
 )
-from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange_energy
+from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange_tank_energy
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
@@ -134,7 +134,7 @@ def test_outputs_are_finite_limited_and_numbered(method):
     np.testing.assert_allclose(np.linalg.norm(command[:, :4], axis=1), 1.0, atol=1e-9)
     for end in range(2):
         np.testing.assert_array_equal(sent[end, :, PACKET_NUMBER], np.arange(1500))
-        assert (sent[end, :, INPUTS_FINITE] == 1).all()
+        assert (sent[end, :, SENDER_INPUTS_FINITE] == 1).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -184,11 +184,15 @@ def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
     master_step(
         m, received, True, START, zero, zero, zero, p[WRENCH_LIMIT], T, p, memory, wrench, packet
     )
-    assert (wrench == 0).all() and packet[INPUTS_FINITE] == 0 and np.isfinite(packet).all()
+    assert (wrench == 0).all() and packet[SENDER_INPUTS_FINITE] == 0 and np.isfinite(packet).all()
     np.testing.assert_array_equal(memory[1:], before[1:])
     slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)
     np.testing.assert_array_equal(command[:7], START)
-    assert (command[7:] == 0).all() and packet[INPUTS_FINITE] == 0 and packet[PACKET_NUMBER] == 2
+    assert (
+        (command[7:] == 0).all()
+        and packet[SENDER_INPUTS_FINITE] == 0
+        and packet[PACKET_NUMBER] == 2
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -327,7 +331,7 @@ def test_tank_with_fastest_sending_is_not_overdrawn():
         memory, packet = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
         full = memory[STORED_ENERGY].copy()
         assert np.all(full > 0.0)
-        _exchange_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
+        _exchange_tank_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
         assert np.all(memory[STORED_ENERGY] >= 0.0)
         np.testing.assert_allclose(memory[STORED_ENERGY] + memory[SENT_ENERGY], full, rtol=1e-12)
 
@@ -337,6 +341,6 @@ def test_overdrawn_tank_keeps_its_deficit():
     p = method_parameters(PassivityConfig(method="two_layer"))
     memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
     memory[STORED_ENERGY] = -1e-3
-    received[ENERGY] = 4e-4
-    _exchange_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    received[CUMULATIVE_ENERGY] = 4e-4
+    _exchange_tank_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
     np.testing.assert_allclose(memory[STORED_ENERGY], -6e-4, rtol=1e-12)

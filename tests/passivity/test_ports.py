@@ -29,7 +29,7 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.energy import energy_balance, port_work
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.packet import ENERGY, pose_difference_into
+from drake_teleop.station.passivity.packet import CUMULATIVE_ENERGY, pose_difference_into
 from drake_teleop.station.passivity.tdpa import TdpaConfig
 from drake_teleop.station.passivity.wave import WaveConfig
 
@@ -144,7 +144,7 @@ def test_tdpa_repays_a_deficit_before_it_sends(method):
     _, _, packets, dx, _ = run(
         method, PassivityConfig(method=method), master, slave, wrench, to_the_slave_alone
     )
-    put_in, (paid, sent) = np.cumsum(2.0 * dx[1, :, 2]), packets[:, :, ENERGY][..., 0]
+    put_in, (paid, sent) = np.cumsum(2.0 * dx[1, :, 2]), packets[:, :, CUMULATIVE_ENERGY][..., 0]
     assert put_in.min() == pytest.approx(-0.06) and put_in[-1] > 0.059 > 4.0 * paid[-1]
     np.testing.assert_allclose(sent[1:], np.maximum(put_in[1:] + paid[:-1], 0.0), atol=1e-12)
 

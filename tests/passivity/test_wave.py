@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME,
+    CHANNEL_FILL_TIME_LEFT,
     RECEIVED_ENERGY,
     STORED_ENERGY,
     WRENCH_LIMIT,
@@ -19,7 +19,7 @@ from drake_teleop.station.passivity.methods import (
     slave_step,
     step_addresses,
 )
-from drake_teleop.station.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
+from drake_teleop.station.passivity.packet import CUMULATIVE_ENERGY, INTEGRAL, PACKET_SIZE, POSE
 from drake_teleop.station.passivity.wave import WaveConfig
 
 T, STEPS = 1e-3, 1200
@@ -37,7 +37,7 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
     )
     start = np.array([1.0, 0, 0, 0, 0, 0, 0])
     memory = [initial_method_memory("wave", p, start) for _ in range(2)]
-    memory[1][CHANNEL_FILL_TIME] = (fills - 0.5) * T
+    memory[1][CHANNEL_FILL_TIME_LEFT] = (fills - 0.5) * T
     sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))
     nothing, zero, wrench = np.zeros(PACKET_SIZE), np.zeros(6), np.zeros((len(motion), 6))
     u = np.zeros(len(motion))
@@ -140,15 +140,19 @@ def test_energy_that_fills_a_line_counts_once():
         np.array([-force, *[0.0] * 5]),
     )
     memory, received = initial_method_memory("wave", p, start), np.zeros(PACKET_SIZE)
-    memory[CHANNEL_FILL_TIME], packet, command = (n - 0.5) * T, np.zeros(PACKET_SIZE), np.zeros(13)
+    memory[CHANNEL_FILL_TIME_LEFT], packet, command = (
+        (n - 0.5) * T,
+        np.zeros(PACKET_SIZE),
+        np.zeros(13),
+    )
     for k in range(n):
-        received[ENERGY] = 0.01 * k
+        received[CUMULATIVE_ENERGY] = 0.01 * k
         slave_step(
             step_addresses("wave"), received, True, start, zero, zero, f_e, T, p, memory, command,
             packet,
         )  # fmt: skip
     power = force**2 / (4.0 * config.impedance[0])
-    np.testing.assert_allclose(packet[ENERGY], [n * T * power, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(packet[CUMULATIVE_ENERGY], [n * T * power, 0.0], rtol=1e-9)
     np.testing.assert_allclose(memory[STORED_ENERGY], [(T + config.filter) * power, 0.0], rtol=1e-9)
     np.testing.assert_allclose(memory[RECEIVED_ENERGY], 0.01 * (n - 1))
 

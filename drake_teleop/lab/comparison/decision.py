@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drake_teleop.lab.comparison.one_dof import TIP_DISTANCE_M
-from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_N
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_AT_REST_N
 
 VERDICT_UNSTABLE, VERDICT_POSITION_ERROR, VERDICT_CHATTERS = (
     "unstable",
@@ -68,7 +68,7 @@ def _summarise_runs_of_method(
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:
         return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
-    if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_N:
+    if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_AT_REST_N:
         return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
     return MethodResult(
         VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS, forces, leaked_J=leaked

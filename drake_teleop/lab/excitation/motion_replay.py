@@ -52,7 +52,7 @@ def write_motion_replay(path: Path, found: Excitation) -> None:
         f"Excitation of {robot.name}",
         times,
         slow_motion,
-        readings=[
+        displayed_numbers=[
             DisplayedNumber("Force of the heaviest load", "N", force[samples], BLUE),
             DisplayedNumber("Speed of the sensor", "m/s", speed),
         ],

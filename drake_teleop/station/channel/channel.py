@@ -23,7 +23,7 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME,
+    CHANNEL_FILL_TIME_LEFT,
     LOAD_WRENCH,
     MEMORY_SIZE,
     WRENCH_LIMIT,
@@ -32,9 +32,9 @@ from drake_teleop.station.passivity.memory import (
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT_FLAG,
-    INPUTS_FINITE,
     PACKET_LOAD_WRENCH,
     PACKET_SIZE,
+    SENDER_INPUTS_FINITE,
     dot_of_group,
     pose_difference_into,
 )
@@ -106,11 +106,11 @@ _ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_M
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
-_LAST_POSE_AT_MASTER = _layout.vector(8)
-_LAST_POSE_AT_SLAVE = _layout.vector(8)  # pose of the slave, likewise
-_RENDERED_WRENCH = _layout.vector(6)  # wrench rendered since the last step
-_LAST_VALID_WRENCH = _layout.vector(6)  # slave's wrench at the last step
-_TIME_WITH_VALID_WRENCH = _layout.number()  # time with valid wrenches [s]
+_LAST_FINITE_MASTER_POSE = _layout.vector(8)
+_LAST_FINITE_SLAVE_POSE = _layout.vector(8)  # pose of the slave, likewise
+_RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
+_LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
+_TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
 _SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
@@ -121,16 +121,16 @@ _MOTION_SCALES = _layout.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
 _layout = SlotAllocator(PORTS_SIGNAL_SIZE)
-_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
-_SILENCE_TIMES, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
+_WORK_OF_HAND_WRENCH, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
+_SILENCE_TIMES_OF_ENDS, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
 _layout = SlotAllocator(7)
-_RECEIVED_WRENCH, _CONTACT_FLAG = _layout.vector(6), _layout.number()
+_RECEIVED_WRENCH, _RECEIVED_CONTACT_FLAG = _layout.vector(6), _layout.number()
 
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
 # takes its step before the slave.
 _MIN_DELAY_STEPS = 1
-_NO_LOAD_WRENCH = np.zeros(6)
+_ZERO_LOAD_WRENCH = np.zeros(6)
 
 
 def initial_state_of_ends(
@@ -138,8 +138,8 @@ def initial_state_of_ends(
 ) -> NDArray[np.float64]:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
-    ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
-    ends[_TIME_WITH_VALID_WRENCH] = STOP_TIME_S
+    ends[_LAST_FINITE_MASTER_POSE][:7] = ends[_LAST_FINITE_SLAVE_POSE][:7] = start
+    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -190,7 +190,7 @@ def step_channel(
     _, fresh = network.receive_packet(backward_parameters, backward, k, received)
     step_master_end(
         steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
-        ports[_WORK_OF_HAND], packet, wrench_received,
+        ports[_WORK_OF_HAND_WRENCH], packet, wrench_received,
     )  # fmt: skip
     network.send_packet(forward_parameters, forward, k, packet)
     _, fresh = network.receive_packet(forward_parameters, forward, k + 1, received)
@@ -199,8 +199,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
-    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -213,7 +213,7 @@ def step_master_end(
     `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
     hand is added to `work` (2,) [J].
     """
-    before, held = ends[_LAST_POSE_AT_MASTER], ends[_RENDERED_WRENCH]
+    before, held = ends[_LAST_FINITE_MASTER_POSE], ends[_RENDERED_HAND_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
     valid = _pose_increment_into(pose_command, before, dx)
@@ -226,7 +226,7 @@ def step_master_end(
         _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
-    healthy = fresh and received[INPUTS_FINITE] > 0.5
+    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     master_limits_into(healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits)
     methods.master_step(
@@ -234,9 +234,9 @@ def step_master_end(
         packet,
     )  # fmt: skip
     if not valid:
-        packet[INPUTS_FINITE] = 0.0
+        packet[SENDER_INPUTS_FINITE] = 0.0
     _convert_wrench_to_master(held, frame, wrench_received[_RECEIVED_WRENCH])
-    wrench_received[_CONTACT_FLAG] = received[CONTACT_FLAG]
+    wrench_received[_RECEIVED_CONTACT_FLAG] = received[CONTACT_FLAG]
 
 
 @njit(cache=True)
@@ -245,7 +245,7 @@ def step_slave_end(
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
-    before, held = ends[_LAST_POSE_AT_SLAVE], ends[_LAST_VALID_WRENCH]
+    before, held = ends[_LAST_FINITE_SLAVE_POSE], ends[_LAST_VALID_SLAVE_WRENCH]
     watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -258,27 +258,27 @@ def step_slave_end(
     load = memory[LOAD_WRENCH]
     if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
-        ends[_TIME_WITH_VALID_WRENCH] = 0.0
+        ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
     elif saturated:
-        ends[_TIME_WITH_VALID_WRENCH] = 0.0
+        ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
         _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME_S - ends[_TIME_WITH_VALID_WRENCH], T)
+        share = T / max(STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _convert_wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TIME_WITH_VALID_WRENCH] += T
+        ends[_TIME_WITH_VALID_SLAVE_WRENCH] += T
     copy_into(wrench, 0, held, 0, 6)
-    healthy = fresh and received[INPUTS_FINITE] > 0.5
+    healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
-        packet[INPUTS_FINITE] = 0.0
+        packet[SENDER_INPUTS_FINITE] = 0.0
     packet[CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
     slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
@@ -435,7 +435,10 @@ class TeleopChannel(LeafSystem):
         time in which the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_POSE_AT_SLAVE][:7], ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME] = slave, fills
+        ends[_LAST_FINITE_SLAVE_POSE][:7], ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = (
+            slave,
+            fills,
+        )
         context.SetDiscreteState(self._groups[2], ends)
         context.SetDiscreteState(self._groups[3], command)
 
@@ -446,7 +449,7 @@ class TeleopChannel(LeafSystem):
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
         forward, backward = zip(state[:2], in_transit, strict=True)
-        load = _NO_LOAD_WRENCH
+        load = _ZERO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
         step_channel(
@@ -472,7 +475,7 @@ class TeleopChannel(LeafSystem):
         output.SetFromVector(self._evaluate_step(context)[-1][_RECEIVED_WRENCH])
 
     def _calc_contact_flag(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._evaluate_step(context)[-1][_CONTACT_FLAG]
+        output[0] = self._evaluate_step(context)[-1][_RECEIVED_CONTACT_FLAG]
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         for part, group in zip(self._evaluate_step(context), self._groups, strict=False):

@@ -28,13 +28,13 @@ from drake_teleop.station.passivity.packet import (
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 MAX_DELAY_S = 10.0  # [s], bounds the memory
 MAX_TRACE_DURATION_S = 36000.0  # [s]
-MAX_EXTRAPOLATION_S = 0.1  # [s]; then the pose stands still
+MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; then the pose stands still
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
 _MAX_DELAY_DEVIATIONS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE_POLICIES = ("hold", "zero", "extrapolate")
-_POLICY_ZERO, _POLICY_EXTRAPOLATE = 1, 2
+_SILENCE_POLICY_ZERO, _SILENCE_POLICY_EXTRAPOLATE = 1, 2
 _TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
 _SILENCE_SIMULATION_S, _SILENCE_SIMULATION_SEED = 60.0, 20090101  # for `longest_silence`
 
@@ -102,12 +102,21 @@ stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2
 """
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
-_RANDOM_KEY, _PERIOD, _MEAN_DELAY_STEPS, _JITTER, _DISTRIBUTION, _MAX_DELAY_STEPS = range(6)
-_BAD_SHARE, _BAD_PERSISTENCE, _BURST_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = range(6, 11)
+(
+    _RANDOM_KEY,
+    _STEP_PERIOD,
+    _MEAN_DELAY_STEPS,
+    _DELAY_JITTER,
+    _DELAY_DISTRIBUTION,
+    _MAX_DELAY_STEPS,
+) = range(6)
+_BAD_STATE_SHARE, _BAD_STATE_PERSISTENCE, _BAD_STATE_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = (
+    range(6, 11)
+)
 _PLAYOUT_STEPS, _IS_REDUNDANT, _NUM_TRANSIT_SLOTS, _SILENCE_POLICY = range(11, 15)
-_MIN_DELAY_STEPS, _TRACE_START = 15, 16
+_MIN_DELAY_STEPS, _DELAY_TRACE_START = 15, 16
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
-_IS_BAD_STATE, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
+_IS_BAD_STATE, _NEWEST_ARRIVED_PACKET, _NEWEST_READ_PACKET, _SILENT_STEPS, _LAST_PACKET = range(5)
 
 
 def network_parameters(
@@ -139,20 +148,20 @@ def network_parameters(
     longest = max(longest, least)
     bad = config.loss / config.burst_loss
     time_constant = config.burst * (1 - bad)  # time constant of the chain
-    p = np.empty(_TRACE_START + trace.size)
+    p = np.empty(_DELAY_TRACE_START + trace.size)
     # 53 bits of a key are exact in a float.
     p[_RANDOM_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
-    p[_PERIOD], p[_JITTER] = period, config.jitter
+    p[_STEP_PERIOD], p[_DELAY_JITTER] = period, config.jitter
     p[_MEAN_DELAY_STEPS], p[_MAX_DELAY_STEPS] = mean, longest
-    p[_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
-    p[_BAD_SHARE] = bad
-    p[_BAD_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
-    p[_BURST_LOSS], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
+    p[_DELAY_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
+    p[_BAD_STATE_SHARE] = bad
+    p[_BAD_STATE_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
+    p[_BAD_STATE_LOSS], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
     p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
     p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
     p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), least
-    p[_TRACE_START:] = trace
+    p[_DELAY_TRACE_START:] = trace
     return p
 
 
@@ -210,16 +219,16 @@ def _random_uniform(p, k, draw):
 @njit(cache=True)
 def _draw_delay_steps(p, k, draw):
     """Return the delay of packet k [steps] from random numbers `draw` to `draw` + 2; -1: lost."""
-    if p.shape[0] > _TRACE_START:
-        steps = p[_TRACE_START + k % (p.shape[0] - _TRACE_START)]
+    if p.shape[0] > _DELAY_TRACE_START:
+        steps = p[_DELAY_TRACE_START + k % (p.shape[0] - _DELAY_TRACE_START)]
         return int(max(steps, p[_MIN_DELAY_STEPS])) if steps >= 0.0 else -1
-    mean, spread = p[_MEAN_DELAY_STEPS], p[_MEAN_DELAY_STEPS] * p[_JITTER]
+    mean, spread = p[_MEAN_DELAY_STEPS], p[_MEAN_DELAY_STEPS] * p[_DELAY_JITTER]
     if spread == 0.0:
         return int(p[_MAX_DELAY_STEPS])
     u = _random_uniform(p, k, draw)
-    if p[_DISTRIBUTION] == 0:
+    if p[_DELAY_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
-    elif p[_DISTRIBUTION] == 1:  # Box and Muller
+    elif p[_DELAY_DISTRIBUTION] == 1:  # Box and Muller
         angle = 2.0 * math.pi * _random_uniform(p, k, draw + 1)
         delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
     else:  # sum of three exponential waits
@@ -231,13 +240,13 @@ def _draw_delay_steps(p, k, draw):
 @njit(cache=True)
 def _draw_loss_and_delays(p, k, bad):
     """Return the loss state (1: bad) at step k; delays of packet and copy [steps] (-1: none)."""
-    if p[_BAD_SHARE] > 0.0:
-        likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_PERSISTENCE]
+    if p[_BAD_STATE_SHARE] > 0.0:
+        likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
     rate = p[_PACKETS_PER_STEP]
     if rate < 1.0 and math.floor(k * rate + 1e-9) == math.floor((k - 1) * rate + 1e-9):
         return bad, -1, -1
-    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BURST_LOSS]:
+    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BAD_STATE_LOSS]:
         return bad, -1, -1
     first = _draw_delay_steps(p, k, 2)
     second = -1
@@ -255,7 +264,7 @@ def initial_network_state(
     first packet.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
-    receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
+    receiver = np.concatenate([[p[_BAD_STATE_SHARE], -1.0, -1.0, 0.0], neutral])
     return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
 
 
@@ -284,38 +293,38 @@ def receive_packet(p, state, k, packet):
     receiver, in_transit = state
     slots, size = int(p[_NUM_TRANSIT_SLOTS]), receiver.shape[0] - _LAST_PACKET
     # An old entry of the slot is smaller and has no effect.
-    receiver[_NEWEST_ARRIVED] = max(receiver[_NEWEST_ARRIVED], in_transit[k % slots])
-    newest = receiver[_NEWEST_ARRIVED]
+    receiver[_NEWEST_ARRIVED_PACKET] = max(receiver[_NEWEST_ARRIVED_PACKET], in_transit[k % slots])
+    newest = receiver[_NEWEST_ARRIVED_PACKET]
     if p[_IS_REDUNDANT] != 0.0:
         newest = min(newest, k - p[_PLAYOUT_STEPS])
-    fresh = newest > receiver[_NEWEST_READ]
+    fresh = newest > receiver[_NEWEST_READ_PACKET]
     if fresh:
-        receiver[_NEWEST_READ], receiver[_SILENT_STEPS] = newest, 0.0
+        receiver[_NEWEST_READ_PACKET], receiver[_SILENT_STEPS] = newest, 0.0
         copy_into(receiver, _LAST_PACKET, in_transit, slots + size * (int(newest) % slots), size)
     else:
         receiver[_SILENT_STEPS] += 1.0
     copy_into(packet, 0, receiver, _LAST_PACKET, size)
     if not fresh:
-        _apply_silence_policy(p[_SILENCE_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
-    return int(receiver[_NEWEST_READ]), fresh
+        _apply_silence_policy(p[_SILENCE_POLICY], receiver[_SILENT_STEPS] * p[_STEP_PERIOD], packet)
+    return int(receiver[_NEWEST_READ_PACKET]), fresh
 
 
 @njit(cache=True)
 def _apply_silence_policy(policy, silent, packet):
     velocity, pose = packet[VELOCITY], packet[POSE]
-    if policy == _POLICY_ZERO:
+    if policy == _SILENCE_POLICY_ZERO:
         velocity[:] = 0.0
         packet[WRENCH] = packet[PACKET_LOAD_WRENCH] = 0.0
-    elif policy == _POLICY_EXTRAPOLATE and has_arrived(packet):
-        move_pose_into(pose, velocity * min(silent, MAX_EXTRAPOLATION_S), pose)
-        if silent > MAX_EXTRAPOLATION_S:
+    elif policy == _SILENCE_POLICY_EXTRAPOLATE and has_arrived(packet):
+        move_pose_into(pose, velocity * min(silent, MAX_POSE_EXTRAPOLATION_S), pose)
+        if silent > MAX_POSE_EXTRAPOLATION_S:
             velocity[:] = 0.0
 
 
 @njit(cache=True)
 def packet_delays(p, steps):
     """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
-    delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
+    delays, bad = np.empty((steps, 2), np.int64), p[_BAD_STATE_SHARE]
     for k in range(steps):
         bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
     return delays

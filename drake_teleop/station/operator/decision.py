@@ -44,11 +44,19 @@ DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
 # Indices of a packed task.
-_TASK_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
-_STANDOFF, _SET_FORCE, _TOLERANCE, _SLOT_DEPTH, _TASK_SIZE = 11, 12, 13, 14, 15
+(
+    _TASK_KIND,
+    _TASK_START_TIME,
+    _TASK_TIMEOUT,
+    _GOAL_TRANSLATION,
+    _APPROACH_AXIS,
+    _TARGET_RADIUS,
+    _DWELL_TIME,
+) = 0, 1, 2, 3, 6, 9, 10
+_STANDOFF, _SET_FORCE, _FORCE_TOLERANCE, _SLOT_DEPTH, _PACKED_TASK_SIZE = 11, 12, 13, 14, 15
 _OPERATOR_RANDOM_STREAM = 2  # random stream; the network's lines use others
 # Indices of a packed person: training, movement and perception.
-_MOTION_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _RANDOM_KEY = 0, 1, 2, 3, 4
+_TOOL_OVER_HAND_MOTION, _FORCE_GAIN, _VISION_DELAY, _FORCE_DELAY, _RANDOM_KEY = 0, 1, 2, 3, 4
 _PEAK_ACCELERATION, _MIN_MOVE_DURATION, _MOTOR_NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
 _VISION_NOISE, _DEPTH_ERROR = 10, 11
 _AIM_ERROR, _WEBER_FRACTION, _R_WB = 12, 13, 14
@@ -93,20 +101,20 @@ def pack_operator_parameters(
 
 
 def pack_task_parameters(task: Task) -> Array:
-    packed = np.zeros(_TASK_SIZE)
+    packed = np.zeros(_PACKED_TASK_SIZE)
     packed[_TASK_KIND] = TASK_CLASSES.index(type(task))
-    packed[[_T_START, _TIMEOUT]] = task.t_start, task.timeout
-    packed[_GOAL : _GOAL + 3] = task.translation
-    packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.target_distance
+    packed[[_TASK_START_TIME, _TASK_TIMEOUT]] = task.t_start, task.timeout
+    packed[_GOAL_TRANSLATION : _GOAL_TRANSLATION + 3] = task.translation
+    packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = np.array(task.translation) / task.target_distance
     if isinstance(task, Reach):
-        packed[[_TARGET_RADIUS, _DWELL]] = task.width / 2, task.dwell
+        packed[[_TARGET_RADIUS, _DWELL_TIME]] = task.width / 2, task.dwell
         return packed
     packed[[_TARGET_RADIUS, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
-    packed[_DWELL] = task.hold if isinstance(task, Press) else task.dwell
+    packed[_DWELL_TIME] = task.hold if isinstance(task, Press) else task.dwell
     if isinstance(task, Press):
-        packed[[_SET_FORCE, _TOLERANCE]] = task.force, task.tolerance
+        packed[[_SET_FORCE, _FORCE_TOLERANCE]] = task.force, task.tolerance
     if isinstance(task, Insert):
-        packed[_AXIS : _AXIS + 3] = 0.0, 0.0, -1.0
+        packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = 0.0, 0.0, -1.0
         packed[[_SET_FORCE, _SLOT_DEPTH]] = task.push, task.depth
     return packed
 
@@ -129,30 +137,33 @@ search for the slot; finished or given up."""
 # Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
 # else -1; estimated contact stiffness; force and displacement of the last press; number of
 # searches; plan.
-_STEP_COUNT, _NEXT_MOVE_TIME, _MET_SINCE, _ASSUMED_STIFFNESS = range(4)
-_LAST_FORCE, _LAST_MOVE, _SEARCHES = range(4, 7)
+_STEP_COUNT, _NEXT_MOVE_TIME, _CRITERION_MET_SINCE, _ASSUMED_CONTACT_STIFFNESS = range(4)
+_LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_START_INDEX + PLAN_SIZE
 
-_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
+_EYE_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
 _MOVE_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
 _APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
 # Perceived depth without contact beyond which the operator gives up, estimate.
 _GIVE_UP_PENETRATION_M = 0.03
 _MIN_CONTACT_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
-_INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
+_INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
-_STUCK_FORCE_SHARE = 0.5  # share of the push force above which the peg is stuck, estimate
+_STUCK_SHARE_OF_PUSH_FORCE = 0.5  # share of the push force above which the peg is stuck, estimate
 # Compliance to lateral force [N/m], largest yield [m], estimates.
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
 _SEARCH_SPIRAL_SCALE_M, _GOLDEN_ANGLE_RAD = 0.5e-3, 2.399963
-_DEPTH_SHARE_AT_FLOOR = 0.8  # share of the depth beyond which contact counts as the floor, estimate
+_FLOOR_DEPTH_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_MET_SINCE], memory[_ASSUMED_STIFFNESS] = -1.0, _INITIAL_STIFFNESS
+    memory[_CRITERION_MET_SINCE], memory[_ASSUMED_CONTACT_STIFFNESS] = (
+        -1.0,
+        _INITIAL_ASSUMED_STIFFNESS,
+    )
     memory[PLAN_START_INDEX + 1] = 1.0
     return memory
 
@@ -162,7 +173,7 @@ def _convert_to_hand_motion(person, vector_W, out):
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
-            out[i] += person[_R_WB + 3 * k + i] * vector_W[k] / person[_MOTION_SCALE]
+            out[i] += person[_R_WB + 3 * k + i] * vector_W[k] / person[_TOOL_OVER_HAND_MOTION]
 
 
 @njit(cache=True)
@@ -177,7 +188,9 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
-        noise = person[_VISION_NOISE] * _draw_normal_number(person, step // _FIXATION_STEPS, 4 + i)
+        noise = person[_VISION_NOISE] * _draw_normal_number(
+            person, step // _EYE_FIXATION_STEPS, 4 + i
+        )
         seen_W[i] = displacement_W[i] + noise
 
 
@@ -201,18 +214,18 @@ def _contact_force_against_axis(task, person, felt):
     for i in range(3):
         axis_B = 0.0
         for k in range(3):
-            axis_B += person[_R_WB + 3 * k + i] * task[_AXIS + k]
+            axis_B += person[_R_WB + 3 * k + i] * task[_APPROACH_AXIS + k]
         along -= felt[i] * axis_B
     return along / person[_FORCE_GAIN] if person[_FORCE_GAIN] > 0.0 else 0.0
 
 
 @njit(cache=True)
 def _update_criterion_met(memory, time, good, still_good):
-    if memory[_MET_SINCE] < 0.0 and good:
-        memory[_MET_SINCE] = time
+    if memory[_CRITERION_MET_SINCE] < 0.0 and good:
+        memory[_CRITERION_MET_SINCE] = time
     elif not still_good:
-        memory[_MET_SINCE] = -1.0
-    return memory[_MET_SINCE] >= 0.0
+        memory[_CRITERION_MET_SINCE] = -1.0
+    return memory[_CRITERION_MET_SINCE] >= 0.0
 
 
 @njit(cache=True)
@@ -223,7 +236,7 @@ def _finish_task(state, memory, time, outcome):
 
 @njit(cache=True)
 def _enter_phase(state, memory, phase, ready):
-    state[PHASE_INDEX], memory[_NEXT_MOVE_TIME], memory[_MET_SINCE] = phase, ready, -1.0
+    state[PHASE_INDEX], memory[_NEXT_MOVE_TIME], memory[_CRITERION_MET_SINCE] = phase, ready, -1.0
 
 
 @njit(cache=True)
@@ -246,11 +259,11 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     if person[_FORCE_GAIN] > 0.0:
         unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
     state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_CONTACT_TRUST)
-    if state[PHASE_INDEX] == PHASE_WAITING and time >= task[_T_START]:
+    if state[PHASE_INDEX] == PHASE_WAITING and time >= task[_TASK_START_TIME]:
         _enter_phase(state, memory, PHASE_MOVING, time)
     if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
         return
-    if time - task[_T_START] > task[_TIMEOUT]:
+    if time - task[_TASK_START_TIME] > task[_TASK_TIMEOUT]:
         _finish_task(state, memory, time, -1.0)
     elif state[PHASE_INDEX] == PHASE_MOVING:
         _move_by_vision(task, person, step, time, seen_W, state, memory)
@@ -261,7 +274,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
             _update_criterion_met(memory, time, True, True)
-            and time - memory[_MET_SINCE] >= task[_DWELL]
+            and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]
         ):
             _finish_task(state, memory, time, 1.0)
     elif state[PHASE_INDEX] == PHASE_PRESSING:
@@ -276,7 +289,7 @@ def _perceived_target_into(task, person, out):
     if task[_TASK_KIND] != KIND_REACH:
         depth = person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
     for i in range(3):
-        out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
+        out[i] = task[_GOAL_TRANSLATION + i] + (depth - task[_STANDOFF]) * task[_APPROACH_AXIS + i]
         if task[_TASK_KIND] == KIND_INSERT and i < 2:
             out[i] += person[_AIM_ERROR] * _draw_normal_number(person, 0, 13 + i)
 
@@ -286,7 +299,7 @@ def _perceived_penetration(task, person, seen_W):
     target, beyond = np.empty(3), -task[_STANDOFF]
     _perceived_target_into(task, person, target)
     for i in range(3):
-        beyond += (seen_W[i] - target[i]) * task[_AXIS + i]
+        beyond += (seen_W[i] - target[i]) * task[_APPROACH_AXIS + i]
     return beyond
 
 
@@ -303,7 +316,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS]
     )
     if task[_TASK_KIND] == KIND_REACH:
-        if met and time - memory[_MET_SINCE] >= task[_DWELL]:
+        if met and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]:
             _finish_task(state, memory, time, 1.0)
             return
     elif met and time >= memory[_NEXT_MOVE_TIME]:
@@ -311,7 +324,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         return
     if not met and time >= memory[_NEXT_MOVE_TIME]:
         duration = _plan_submovement(person, memory, step, time, error)
-        memory[_NEXT_MOVE_TIME] = time + duration + person[_VISION_WAIT]
+        memory[_NEXT_MOVE_TIME] = time + duration + person[_VISION_DELAY]
 
 
 @njit(cache=True)
@@ -320,19 +333,21 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt):
             plan_stop(memory, time)
             _enter_phase(
-                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person[_FORCE_WAIT]
+                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person[_FORCE_DELAY]
             )
             return
     elif state[CONTACT_PERCEIVED_INDEX] > 0.0:
         plan_stop(memory, time)
-        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_WAIT])
+        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_DELAY])
         return
     if _perceived_penetration(task, person, seen_W) > task[_SLOT_DEPTH] + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
-            velocity_W[i] = state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
+            velocity_W[i] = (
+                state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_APPROACH_AXIS + i]
+            )
         _convert_to_hand_motion(person, velocity_W, speed)
         plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
         for i in range(3):
@@ -351,13 +366,15 @@ def _perceived_contact_force(task, person, felt, memory):
 
 @njit(cache=True)
 def _displacement_to_set_force(task, memory, force):
-    effect = force - memory[_LAST_FORCE]
-    if effect * memory[_LAST_MOVE] > 0.0:
-        stiffness = 0.5 * (memory[_ASSUMED_STIFFNESS] + effect / memory[_LAST_MOVE])
-        memory[_ASSUMED_STIFFNESS] = min(max(stiffness, _MIN_STIFFNESS), _MAX_STIFFNESS)
-    move = (task[_SET_FORCE] - force) / memory[_ASSUMED_STIFFNESS]
+    effect = force - memory[_LAST_PRESS_FORCE]
+    if effect * memory[_LAST_PRESS_MOTION] > 0.0:
+        stiffness = 0.5 * (memory[_ASSUMED_CONTACT_STIFFNESS] + effect / memory[_LAST_PRESS_MOTION])
+        memory[_ASSUMED_CONTACT_STIFFNESS] = min(
+            max(stiffness, _MIN_ASSUMED_STIFFNESS), _MAX_ASSUMED_STIFFNESS
+        )
+    move = (task[_SET_FORCE] - force) / memory[_ASSUMED_CONTACT_STIFFNESS]
     move = min(max(move, -_MAX_PRESS_CORRECTION_M), _MAX_PRESS_CORRECTION_M)
-    memory[_LAST_FORCE], memory[_LAST_MOVE] = force, move
+    memory[_LAST_PRESS_FORCE], memory[_LAST_PRESS_MOTION] = force, move
     return move
 
 
@@ -366,21 +383,23 @@ def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task[_SET_FORCE] - force)
     met = _update_criterion_met(
-        memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE]
+        memory, time, error <= 0.5 * task[_FORCE_TOLERANCE], error <= task[_FORCE_TOLERANCE]
     )
-    if met and time - memory[_MET_SINCE] >= task[_DWELL]:
+    if met and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
         move = _displacement_to_set_force(task, memory, force)
-        duration = _plan_submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
-        memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_WAIT]
+        duration = _plan_submovement(
+            person, memory, step, time, move * task[_APPROACH_AXIS : _APPROACH_AXIS + 3]
+        )
+        memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]
 
 
 @njit(cache=True)
 def _lateral_force_into(task, person, felt, out):
     along, size = _contact_force_against_axis(task, person, felt), 0.0
     for i in range(3):
-        out[i] = along * task[_AXIS + i]
+        out[i] = along * task[_APPROACH_AXIS + i]
         for k in range(3):
             if person[_FORCE_GAIN] > 0.0:
                 out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_FORCE_GAIN]
@@ -390,7 +409,7 @@ def _lateral_force_into(task, person, felt, out):
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
-    limit = _STUCK_FORCE_SHARE * task[_SET_FORCE]
+    limit = _STUCK_SHARE_OF_PUSH_FORCE * task[_SET_FORCE]
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
     return _contact_force_against_axis(task, person, felt) >= limit or sideways >= limit
 
@@ -407,8 +426,8 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_penetration(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_SLOT_DEPTH]
-    if deep and abs(force - task[_SET_FORCE]) <= _STUCK_FORCE_SHARE * task[_SET_FORCE]:
+    deep = _perceived_penetration(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task[_SLOT_DEPTH]
+    if deep and abs(force - task[_SET_FORCE]) <= _STUCK_SHARE_OF_PUSH_FORCE * task[_SET_FORCE]:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     move, push = np.empty(3), _displacement_to_set_force(task, memory, force)
@@ -418,12 +437,12 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         for i in range(3):
             move[i] *= share
     else:
-        n = memory[_SEARCHES]
-        memory[_SEARCHES] += 1.0
+        n = memory[_NUM_SLOT_SEARCHES]
+        memory[_NUM_SLOT_SEARCHES] += 1.0
         for k in range(2):
             move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
     for i in range(3):
-        move[i] += push * task[_AXIS + i]
+        move[i] += push * task[_APPROACH_AXIS + i]
     duration = _plan_submovement(person, memory, step, time, move)
-    memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_WAIT]
+    memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _FORCE_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
-_FRICTION_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
+_FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
 _NUM_MODEL_PARAMETERS = 6
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
@@ -93,7 +93,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
     memory[_SAMPLE_COUNT] += 1.0
     # Values midway between two samples, where the velocity difference gives the acceleration.
-    speed = _FRICTION_SPEED_M_PER_S * _FRICTION_SPEED_M_PER_S
+    speed = _FRICTION_SMOOTHING_SPEED_M_PER_S * _FRICTION_SMOOTHING_SPEED_M_PER_S
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)

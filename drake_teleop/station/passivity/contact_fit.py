@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 
-NUM_FIT_SUMS = 5  #: number of sums of the fit; all are 0 at the start
+NUM_CONTACT_FIT_SUMS = 5  #: number of sums of the fit; all are 0 at the start
 # Relative increase of the squared speed changes: where speed and displacement are proportional, the
 # fit then assigns the force to stiffness.
 _DAMPING_RIDGE_SHARE = 0.05
@@ -17,9 +17,9 @@ _DAMPING_RIDGE_SHARE = 0.05
 def update_contact_fit(sums, force_change, displacement, speed_change, keep):
     """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
-    `sums` (NUM_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
+    `sums` (NUM_CONTACT_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """
-    for i in range(NUM_FIT_SUMS):
+    for i in range(NUM_CONTACT_FIT_SUMS):
         sums[i] *= keep
     sums[0] += displacement * displacement
     sums[1] += displacement * speed_change

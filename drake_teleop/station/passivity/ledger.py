@@ -16,30 +16,30 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import ledger_slave
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
-    CONTACT_DAMPING,
     CONTACT_DIRECTION,
-    CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
     DRAG_WRENCH,
     ENCODER_STEP,
+    FILTERED_OWN_VELOCITY,
     IN_CONTACT,
-    INITIAL_ENERGY,
-    LEDGER_LEVEL,
+    INITIAL_LEDGER_ENERGY,
     MASTER_RESERVE,
-    MEAN_WRENCH,
+    MEAN_CONTACT_WRENCH,
     NEWEST_SLAVE_PACKET,
-    OWN_VELOCITY,
+    PACKET_CONTACT_DAMPING,
+    PACKET_CONTACT_STIFFNESS,
+    PACKET_LEDGER_LEVEL,
+    RESERVE_SHARE_AT_MASTER,
     ROUND_TRIP,
     SERVO_MODEL_POSE,
-    SHARED_RESERVE_SHARE,
     SLAVE_MASS_FACTOR,
     SLAVE_RESERVE,
     TORQUE_PER_FORCE,
     UNUSED_RESERVE_SHARE,
     WRENCH_METRIC,
+    add_received_energy,
     filter_velocity,
     is_in_contact,
-    receive_energy,
     update_contact_direction,
     work_along,
     wrench_component_along,
@@ -54,8 +54,8 @@ from drake_teleop.station.passivity.memory import (
     own_memory,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
-    MAX_WRENCH_RATE,
+    CUMULATIVE_ENERGY,
+    MAX_HAND_WRENCH_RATE,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     POSE,
@@ -72,52 +72,52 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
-_VELOCITY_FILTER_S = 4e-3
-_STIFFNESS_MARGIN = 1.1
+_HAND_VELOCITY_FILTER_S = 4e-3
+_CONTACT_STIFFNESS_FACTOR = 1.1
 _MAX_WALL_STIFFNESS, _MIN_WALL_STIFFNESS = 2500.0, 50.0  # N/m
-_PREDICTION_LEAD_STEPS = 2.0
-_ONSET_OFFSET_FADE_S = 0.3
-_FRICTION_MEMORY_S = 1.0
-_MIN_FRICTION_RELAXATION_S, _SLIP_SPEED = 0.1, 1e-3
-_TORQUE_RELAXATION_S, _TORQUE_RELAXATION_ROUND_TRIPS = 0.6, 30.0
+_HAND_PREDICTION_LEAD_STEPS = 2.0
+_HAND_OFFSET_FADE_S = 0.3
+_FRICTION_COEFFICIENT_DECAY_S = 1.0
+_MIN_FRICTION_RELAXATION_S, _FRICTION_SLIP_SPEED = 0.1, 1e-3
+_FRICTION_TORQUE_RELAXATION_S, _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS = 0.6, 30.0
 _ROTATION_FRICTION_STIFFNESS_FACTOR, _MAX_FRICTION_COEFFICIENT = 4.0, 1.0
 _MIN_WRENCH_NORM_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
-_MAX_PREDICTED_RISE_N = 3.0
+_MAX_PREDICTED_FORCE_RISE_N = 3.0
 _MAX_WALL_FORCE_N = 10.0
-_SAME_WALL_DISTANCE_M, _SAME_WALL_COSINE = 5e-3, 0.7
-_MAX_REMOVAL_DEPTH_M, _EXPECTED_REMOVAL_FORCE_N, _MIN_REMOVAL_DEPTH_M = 3e-3, 1.0, 1e-3
-_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
-_INPUT_FORWARDING_LEVEL = 0.5  # of the master's reserve
-_UNUSED_RESERVE_LEVEL = 0.05  # of the master's reserve
-_DRAIN_RATE = 50.0  # 1/s
-_RELEASE_DISTANCE_M = 0.03
-_WRENCH_RECOVERY_S = 1.0
+_MAX_SAME_WALL_DISTANCE_M, _MIN_SAME_WALL_COSINE = 5e-3, 0.7
+_MAX_FORGET_WALL_DEPTH_M, _FORGET_WALL_FORCE_N, _MIN_FORGET_WALL_DEPTH_M = 3e-3, 1.0, 1e-3
+_MIN_WALL_IMPULSE_DEPTH_M, _MAX_MISSING_IMPULSE_NS = 0.3e-3, 0.03
+_HAND_INPUT_SENDING_LEVEL = 0.5  # of the master's reserve
+_UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
+_MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
+_ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
+_WITHHELD_WRENCH_RECOVERY_S = 1.0
 _MAX_HAND_ACCELERATION = 5.0  # m/s^2
-_FULL_DRAG_SPEED = 0.02  # m/s
-_HAND_REST_S = 0.1
-_DRAG_FADE = 0.25  # of the master's reserve
-_LOST_MOTION_STEPS = 1.1  # of the encoders
-_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - SHARED_RESERVE_SHARE, 1.0 - 1e-9  # of a reserve; rounding
-_BRAKE_FORCE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
+_FULL_DRAG_HAND_SPEED = 0.02  # m/s
+_FADE_TIME_AT_HAND_REST_S = 0.1
+_DRAG_FADE_LEVEL_RANGE = 0.25  # of the master's reserve
+_LOST_HAND_MOTION_ENCODER_STEPS = 1.1  # of the encoders
+_DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
+_HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `CONTACT_DIRECTION`.
 _layout = own_memory()
-_layout.vector(CONTACT_DIRECTION.stop - OWN_VELOCITY.start)
+_layout.vector(CONTACT_DIRECTION.stop - FILTERED_OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
-_ONSET_OFFSET, _INTO_WALL = _layout.vector(6), _layout.vector(6)
-_WALL_STIFFNESS, _HAND_DEPTH, _MISSING_IMPULSE = (_layout.number() for _ in range(3))
+_HAND_OFFSET_AT_CONTACT_ONSET, _DIRECTION_INTO_WALL = _layout.vector(6), _layout.vector(6)
+_WALL_STIFFNESS, _HAND_WALL_DEPTH, _MISSING_WALL_IMPULSE = (_layout.number() for _ in range(3))
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
 _MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE = _layout.vector(6), _layout.vector(6)
-_FRICTION_RESIDUAL, _FRICTION_COEFFICIENT = _layout.vector(6), _layout.vector(2)
-_RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
+_UNMODELLED_FRICTION, _FRICTION_COEFFICIENT = _layout.vector(6), _layout.vector(2)
+_HAND_RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
 _LAST_SLAVE_POSE, _SLAVE_DISPLACEMENT = _layout.vector(7), _layout.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
-_WORK_ON_HAND_SINCE_REST, _WITHHELD_SHARE = _layout.vector(2), _layout.vector(2)
-_DRAG_ACTIVE = _layout.vector(2)
-_LOST_MOTION, _STEADY_STEP = _layout.vector(6), _layout.vector(6)
+_WORK_ON_HAND_SINCE_REST, _WITHHELD_WRENCH_SHARE = _layout.vector(2), _layout.vector(2)
+_IS_DRAG_ACTIVE = _layout.vector(2)
+_LOST_HAND_MOTION, _HAND_STEP_WITHOUT_FLICKER = _layout.vector(6), _layout.vector(6)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
-_NEWEST_PACKET, _IS_CROSS_FADING = _layout.number(), _layout.vector(2)
+_LAST_RECEIVED_PACKET_NUMBER, _IS_WRENCH_CROSS_FADING = _layout.number(), _layout.vector(2)
 _LAST_UNLIMITED_WRENCH = _layout.vector(6)
 
 
@@ -158,7 +158,7 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[INITIAL_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
+        p[INITIAL_LEDGER_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
             self.hand_reserve,
@@ -171,7 +171,7 @@ class LedgerConfig:
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[STORED_ENERGY] = p[INITIAL_ENERGY] / 2.0
+    memory[STORED_ENERGY] = p[INITIAL_LEDGER_ENERGY] / 2.0
     memory[SERVO_MODEL_POSE] = memory[COMMAND_POSE]
 
 
@@ -186,60 +186,60 @@ def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
+    velocity, offset_to_slave = memory[FILTERED_OWN_VELOCITY], wrench  # overwritten below
     _remove_encoder_flicker(dx, p, memory)
-    steady = memory[_STEADY_STEP]
+    steady = memory[_HAND_STEP_WITHOUT_FLICKER]
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
-    filter_velocity(offset_to_slave, min(T / _VELOCITY_FILTER_S, 1.0), memory)
-    memory[_HAND_DEPTH] += work_along(memory[_INTO_WALL], steady)
-    inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_DEPTH] > 0.0
+    filter_velocity(offset_to_slave, min(T / _HAND_VELOCITY_FILTER_S, 1.0), memory)
+    memory[_HAND_WALL_DEPTH] += work_along(memory[_DIRECTION_INTO_WALL], steady)
+    inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_HAND_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        receive_energy(g, received, memory)
+        add_received_energy(g, received, memory)
     offset_to_slave[:] = 0.0
     if has_arrived(received):
         pose_difference_into(pose, received[POSE], offset_to_slave)
         for i in range(6):
-            offset_to_slave[i] -= memory[_LOST_MOTION][i]
+            offset_to_slave[i] -= memory[_LOST_HAND_MOTION][i]
     _predict_contact(received, steady, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
         wrench[i] += received[PACKET_LOAD_WRENCH][i]
     newest = received[PACKET_NUMBER]
-    if newest > memory[_NEWEST_PACKET] + 1.0:
-        memory[_IS_CROSS_FADING] = 1.0
-    memory[_NEWEST_PACKET] = newest
+    if newest > memory[_LAST_RECEIVED_PACKET_NUMBER] + 1.0:
+        memory[_IS_WRENCH_CROSS_FADING] = 1.0
+    memory[_LAST_RECEIVED_PACKET_NUMBER] = newest
     for g in range(2):
         _cross_fade_wrench(g, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[MASTER_RESERVE][g]
         if memory[IN_CONTACT] > 0.0:
-            level += SHARED_RESERVE_SHARE * p[SLAVE_RESERVE][g]
+            level += RESERVE_SHARE_AT_MASTER * p[SLAVE_RESERVE][g]
         surplus = max(memory[STORED_ENERGY][g] - level, 0.0)
         memory[SENT_ENERGY][g] += surplus
         memory[STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
-        packet[ENERGY][g], packet[LEDGER_LEVEL][g] = (
+        packet[CUMULATIVE_ENERGY][g], packet[PACKET_LEDGER_LEVEL][g] = (
             memory[SENT_ENERGY][g],
             memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g],
         )
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
-        steady[i] = -memory[_LOST_MOTION][i]
+        steady[i] = -memory[_LOST_HAND_MOTION][i]
     move_pose_into(packet[POSE], steady, packet[POSE])
     packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
 
 
 @njit(cache=True)
 def _remove_encoder_flicker(dx, p, memory):
-    lost, steady = memory[_LOST_MOTION], memory[_STEADY_STEP]
+    lost, steady = memory[_LOST_HAND_MOTION], memory[_HAND_STEP_WITHOUT_FLICKER]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             lost[i] += dx[i]
-        size, width = length_of_group(lost, g), _LOST_MOTION_STEPS * p[ENCODER_STEP][g]
+        size, width = length_of_group(lost, g), _LOST_HAND_MOTION_ENCODER_STEPS * p[ENCODER_STEP][g]
         share = 1.0 - width / size if size > width else 0.0
         for i in range(3 * g, 3 * g + 3):
             steady[i] = share * lost[i]
@@ -250,7 +250,7 @@ def _remove_encoder_flicker(dx, p, memory):
 def _update_hand_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[LAST_WRENCH], dx, g), memory[STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
-    if work < 0.0 and in_contact and ledger[g] > _INPUT_FORWARDING_LEVEL * p[MASTER_RESERVE][g]:
+    if work < 0.0 and in_contact and ledger[g] > _HAND_INPUT_SENDING_LEVEL * p[MASTER_RESERVE][g]:
         memory[SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
@@ -262,71 +262,79 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal, inward = received[WRENCH], memory[CONTACT_DIRECTION], memory[_INTO_WALL]
-    k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
+    contact_wrench, normal, inward = (
+        received[WRENCH],
+        memory[CONTACT_DIRECTION],
+        memory[_DIRECTION_INTO_WALL],
+    )
+    k = min(_CONTACT_STIFFNESS_FACTOR * received[PACKET_CONTACT_STIFFNESS], _MAX_WALL_STIFFNESS)
     if not is_in_contact(contact_wrench, p):
         if memory[IN_CONTACT] > 0.0:
-            memory[_IS_CROSS_FADING][:] = 1.0
+            memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
         memory[IN_CONTACT] = 0.0
-        removal_depth = _EXPECTED_REMOVAL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
-        removal_depth = min(_MAX_REMOVAL_DEPTH_M, max(removal_depth, _MIN_REMOVAL_DEPTH_M))
-        slave_depth = memory[_HAND_DEPTH] - work_along(inward, offset_to_slave)
-        memory[_MISSING_IMPULSE] += T * memory[_WALL_STIFFNESS] * (slave_depth - _IMPULSE_DEPTH_M)
-        if slave_depth <= _IMPULSE_DEPTH_M:
-            memory[_MISSING_IMPULSE] = 0.0
-        if memory[_WALL_STIFFNESS] > 0.0 and received[CONTACT_STIFFNESS] == 0.0:
+        removal_depth = _FORGET_WALL_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
+        removal_depth = min(_MAX_FORGET_WALL_DEPTH_M, max(removal_depth, _MIN_FORGET_WALL_DEPTH_M))
+        slave_depth = memory[_HAND_WALL_DEPTH] - work_along(inward, offset_to_slave)
+        memory[_MISSING_WALL_IMPULSE] += (
+            T * memory[_WALL_STIFFNESS] * (slave_depth - _MIN_WALL_IMPULSE_DEPTH_M)
+        )
+        if slave_depth <= _MIN_WALL_IMPULSE_DEPTH_M:
+            memory[_MISSING_WALL_IMPULSE] = 0.0
+        if memory[_WALL_STIFFNESS] > 0.0 and received[PACKET_CONTACT_STIFFNESS] == 0.0:
             memory[_WALL_STIFFNESS] = 0.0
-            memory[_IS_CROSS_FADING][:] = memory[_WORK_ON_HAND_SINCE_REST][:] = 0.0
-        if slave_depth > removal_depth or memory[_MISSING_IMPULSE] > _MAX_MISSING_IMPULSE_NS:
+            memory[_IS_WRENCH_CROSS_FADING][:] = memory[_WORK_ON_HAND_SINCE_REST][:] = 0.0
+        if slave_depth > removal_depth or memory[_MISSING_WALL_IMPULSE] > _MAX_MISSING_IMPULSE_NS:
             memory[_WALL_STIFFNESS] = 0.0
-        inside = min(memory[_WALL_STIFFNESS] * max(memory[_HAND_DEPTH], 0.0), _MAX_WALL_FORCE_N)
+        inside = min(
+            memory[_WALL_STIFFNESS] * max(memory[_HAND_WALL_DEPTH], 0.0), _MAX_WALL_FORCE_N
+        )
         for i in range(6):
             wrench[i] = -inside * inward[i]
         return
-    memory[_MISSING_IMPULSE] = 0.0
-    offset, onset = memory[_ONSET_OFFSET], memory[IN_CONTACT] == 0.0
-    if onset or not wrench_component_along(contact_wrench, memory[MEAN_WRENCH], p) > 0.0:
-        memory[_IS_CROSS_FADING][:] = 1.0
+    memory[_MISSING_WALL_IMPULSE] = 0.0
+    offset, onset = memory[_HAND_OFFSET_AT_CONTACT_ONSET], memory[IN_CONTACT] == 0.0
+    if onset or not wrench_component_along(contact_wrench, memory[MEAN_CONTACT_WRENCH], p) > 0.0:
+        memory[_IS_WRENCH_CROSS_FADING][:] = 1.0
     size = update_contact_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
-    damper, speed = received[CONTACT_DAMPING], work_along(normal, received[VELOCITY])
+    damper, speed = received[PACKET_CONTACT_DAMPING], work_along(normal, received[VELOCITY])
     depth = max(size + damper * speed, 0.0) / max(k, _MIN_WALL_STIFFNESS)
     depth -= work_along(normal, offset_to_slave)
     if onset:
-        aligned = -wrench_component_along(normal, inward, p) > _SAME_WALL_COSINE
+        aligned = -wrench_component_along(normal, inward, p) > _MIN_SAME_WALL_COSINE
         same = memory[_WALL_STIFFNESS] > 0.0 and aligned
-        near = abs(depth - memory[_HAND_DEPTH]) < _SAME_WALL_DISTANCE_M
-        if same and (near or memory[_HAND_DEPTH] < 0.0):
+        near = abs(depth - memory[_HAND_WALL_DEPTH]) < _MAX_SAME_WALL_DISTANCE_M
+        if same and (near or memory[_HAND_WALL_DEPTH] < 0.0):
             offset[:] = 0.0
         else:
             copy_into(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
         memory[_FRICTION_COEFFICIENT][:] = 0.0
-        memory[_RETREAT_DISTANCE] = 0.0
-        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _FRICTION_RESIDUAL):
+        memory[_HAND_RETREAT_DISTANCE] = 0.0
+        for friction in (_MODEL_FRICTION_AT_HAND, _MODEL_FRICTION_AT_SLAVE, _UNMODELLED_FRICTION):
             memory[friction] = 0.0
         copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
-    fade = 1.0 - min(T / _ONSET_OFFSET_FADE_S, 1.0)
+    fade = 1.0 - min(T / _HAND_OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
         offset_to_slave[i] -= offset[i]
-    hand_speed = work_along(normal, memory[OWN_VELOCITY])
-    penetration = work_along(normal, offset_to_slave) + _PREDICTION_LEAD_STEPS * T * hand_speed
+    hand_speed = work_along(normal, memory[FILTERED_OWN_VELOCITY])
+    penetration = work_along(normal, offset_to_slave) + _HAND_PREDICTION_LEAD_STEPS * T * hand_speed
     force = size
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)
-        force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTED_RISE_N)
+        force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTED_FORCE_RISE_N)
     # A hand that was let go moves out of a soft wall without end, so its force fades.
-    retreat = max(memory[_RETREAT_DISTANCE] + work_along(normal, dx), 0.0)
-    if abs(hand_speed) < _FULL_DRAG_SPEED:
-        retreat *= 1.0 - min(T / _HAND_REST_S, 1.0)
-    memory[_RETREAT_DISTANCE] = retreat
-    force *= min(max(3.0 * (1.0 - retreat / _RELEASE_DISTANCE_M), 0.0), 1.0)
+    retreat = max(memory[_HAND_RETREAT_DISTANCE] + work_along(normal, dx), 0.0)
+    if abs(hand_speed) < _FULL_DRAG_HAND_SPEED:
+        retreat *= 1.0 - min(T / _FADE_TIME_AT_HAND_REST_S, 1.0)
+    memory[_HAND_RETREAT_DISTANCE] = retreat
+    force *= min(max(3.0 * (1.0 - retreat / _ZERO_FORCE_RETREAT_DISTANCE_M), 0.0), 1.0)
     _update_slave_displacement(received, memory)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
     if k > _MIN_WALL_STIFFNESS:
-        memory[_WALL_STIFFNESS], memory[_HAND_DEPTH] = k, depth
+        memory[_WALL_STIFFNESS], memory[_HAND_WALL_DEPTH] = k, depth
         for i in range(6):
             inward[i] = -normal[i]
 
@@ -345,19 +353,25 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
     """
     near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
-    rest, normal = memory[_FRICTION_RESIDUAL], memory[CONTACT_DIRECTION]
+    rest, normal = memory[_UNMODELLED_FRICTION], memory[CONTACT_DIRECTION]
     slave_step, cone = memory[_SLAVE_DISPLACEMENT], memory[_FRICTION_COEFFICIENT]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
     copy_into(wrench, 0, received, WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
-    decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
+    decay = min(T / max(_FRICTION_COEFFICIENT_DECAY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
         metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
-        lag = max(cone[g] * size / (_MAX_WALL_STIFFNESS * _SLIP_SPEED), _MIN_FRICTION_RELAXATION_S)
+        lag = max(
+            cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED),
+            _MIN_FRICTION_RELAXATION_S,
+        )
         if g == 1:
-            lag = max(_TORQUE_RELAXATION_S, _TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP])
+            lag = max(
+                _FRICTION_TORQUE_RELAXATION_S,
+                _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP],
+            )
         share = T / lag
         for i in range(3 * g, 3 * g + 3):
             inward = metric * normal[i]
@@ -393,10 +407,10 @@ def _remove_normal_component(wrench, p, memory):
 
 @njit(cache=True)
 def _cross_fade_wrench(g, T, p, memory, wrench):
-    last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_CROSS_FADING]
+    last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_WRENCH_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
-    size, most = length_of_group(wrench, g), MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
+    size, most = length_of_group(wrench, g), MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
     if fading[g] > 0.0 and size > most:
         scale_group(wrench, g, most / size)
     else:
@@ -410,17 +424,17 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
 def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     size, cost = length_of_group(wrench, g), 0.0
     if size > 0.0:
-        displacement = dot_of_group(wrench, memory[OWN_VELOCITY], g) / size * T
+        displacement = dot_of_group(wrench, memory[FILTERED_OWN_VELOCITY], g) / size * T
         cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _MAX_HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    most = min(T * _DRAIN_RATE, 1.0) * max(
-        memory[STORED_ENERGY][g] - _UNUSED_RESERVE_LEVEL * p[MASTER_RESERVE][g], 0.0
+    most = min(T * _MAX_LEDGER_DRAIN_RATE, 1.0) * max(
+        memory[STORED_ENERGY][g] - _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g], 0.0
     )
-    share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _WRENCH_RECOVERY_S)
+    share = min(1.0, 1.0 - memory[_WITHHELD_WRENCH_SHARE][g] + T / _WITHHELD_WRENCH_RECOVERY_S)
     if share * cost > most:
         share = most / cost
-    memory[_WITHHELD_SHARE][g] = 1.0 - share
+    memory[_WITHHELD_WRENCH_SHARE][g] = 1.0 - share
     if not cost > 0.0:
         share *= _permitted_braking_share(g, dx, T, p, memory)
     scale_group(wrench, g, share)
@@ -428,23 +442,23 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_braking_share(g, dx, T, p, memory):
-    if memory[STORED_ENERGY][g] >= _UNUSED_RESERVE_LEVEL * p[MASTER_RESERVE][g]:
+    if memory[STORED_ENERGY][g] >= _UNUSED_MASTER_RESERVE_SHARE * p[MASTER_RESERVE][g]:
         return 1.0
-    velocity = memory[OWN_VELOCITY]
+    velocity = memory[FILTERED_OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
     return min(max(along, 0.0) / max(along, T * speed * speed, 1e-300), 1.0)
 
 
 @njit(cache=True)
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
-    velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
+    velocity, drag, active = memory[FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
     speed, own_level = (
         length_of_group(velocity, g),
         memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g],
     )
     # Sent energy counts as arrived: its confirmation takes a round trip.
     lowest = min(
-        own_level, (received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
+        own_level, (received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
     )
     in_contact = memory[IN_CONTACT] > 0.0
     if (in_contact and own_level < _DRAG_OFF_LEVEL) or (not in_contact and lowest < _DRAG_ON_LEVEL):
@@ -454,16 +468,16 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
     if active[g] > 0.0:
         drag = p[DRAG_WRENCH][g]
         if in_contact:
-            drag *= min((1.0 - own_level) / _DRAG_FADE, 1.0)
-    if speed < _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g]:
-        memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
+            drag *= min((1.0 - own_level) / _DRAG_FADE_LEVEL_RANGE, 1.0)
+    if speed < _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g]:
+        memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _FADE_TIME_AT_HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND_SINCE_REST][g] > 0.0:
-        excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_SPEED
-        share = excess / (_FULL_BRAKE_SPEED - _NO_BRAKE_SPEED)
-        drag = max(drag, _BRAKE_FORCE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
+        excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_HAND_SPEED
+        share = excess / (_FULL_BRAKE_HAND_SPEED - _NO_BRAKE_HAND_SPEED)
+        drag = max(drag, _HAND_BRAKE_FORCE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
     drag *= _permitted_braking_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
-        wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g])
+        wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g])
 
 
 slave_step, record_command = ledger_slave.slave_step, ledger_slave.record_command

@@ -10,7 +10,7 @@ import math
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.contact_fit import (
-    NUM_FIT_SUMS,
+    NUM_CONTACT_FIT_SUMS,
     force_change_by_slip,
     force_without_slip_steps,
     update_contact_fit,
@@ -33,7 +33,7 @@ from drake_teleop.station.passivity.memory import (
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     INTEGRAL,
     PACKET_LOAD_WRENCH,
     POSE,
@@ -55,68 +55,81 @@ from drake_teleop.station.passivity.packet import (
 #: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 UNUSED_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
-SHARED_RESERVE_SHARE = 0.7  #: share of the slave's reserve that the master may hold in contact
-_MIN_KEPT_RESERVE_SHARE = 0.05
+RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
+_MIN_KEPT_SLAVE_RESERVE_SHARE = 0.05
 _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
-_MAX_ENERGY_IN_RESERVES = 4.0  # over the reserve
-_MEASUREMENT_FILTER_S = 3e-3
-_REST_SPEED = 0.05  # m/s
-_REST_SEND_RATE, _SEND_RATE = 20.0, 50.0  # 1/s
-_MAXIMA_DECAY_S = 5.0
+_MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # over the reserve
+_SLAVE_MEASUREMENT_FILTER_S = 3e-3
+_SLAVE_REST_SPEED = 0.05  # m/s
+_ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 20.0, 50.0  # 1/s
+_LONGEST_DELAY_DECAY_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
 _HAND_PRESSING_SPEED = 0.06  # m/s
-_STRETCH_M, _FAST_STRETCH_M = 2e-4, 2e-3
-_MIN_FIT_M, _MAX_FIT_M = 1e-3, 1e-2
+_MIN_FIT_SAMPLE_LENGTH_M, _MIN_FAST_FIT_SAMPLE_LENGTH_M = 2e-4, 2e-3
+_MIN_FIT_SPAN_M, _MAX_FIT_SPAN_M = 1e-3, 1e-2
 _FAST_FIT_SPEED = 0.15  # m/s
-_SHARE_FILTER_S, _SHARE_DEADBAND = 0.02, 0.1
+_STIFFNESS_SHARE_FILTER_S, _STIFFNESS_SHARE_DEADBAND = 0.02, 0.1
 _MIN_REMOVED_WALL_FORCE_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
-_SLIP_FORCE_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
-_GAIN_RISE_S, _MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
-_COMMAND_FILTER_S, _MAX_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
+_SLIP_FORCE_FADE_S, _FRICTION_DECAY_S = 0.6, 1.0
+_STIFFNESS_GAIN_RISE_S, _MIN_STIFFNESS_GAIN, _MAX_STIFFNESS_GAIN, _STIFFNESS_GAIN_FALL_S = (
+    0.5,
+    0.1,
+    10.0,
+    1.0,
+)
+_COMMAND_FILTER_S, _MAX_COMMAND_ACCELERATION, _STOPPING_SPEED_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2
 _MAX_FEEDFORWARD_SILENCE_S = 0.02
-_MAX_SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
+_MAX_SILENCE_FOR_GAIN_ROUND_TRIPS, _MAX_SILENCE_FOR_GAIN_S = 0.5, 0.06
 _MOTOR_ENERGY_HORIZON_S = 4e-3
-_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
-_STANDSTILL_SPEED, _MAX_BRAKE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
+_WALL_FORCE_WITHOUT_HAND_ENERGY_N = 5.0
+_SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
-LEDGER_LEVEL = SECOND_ENERGY_COUNTER
+PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, ROUND_TRIP = range(
+    INTEGRAL.start, INTEGRAL.start + 3
+)
+PACKET_LEDGER_LEVEL = SECOND_ENERGY_COUNTER
 NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _layout = own_parameters()
-INITIAL_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
+INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
 DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
 WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _layout = own_memory()
-OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
-MEAN_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
+FILTERED_OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
+MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
 SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
 _MOTOR_WRENCH = _layout.vector(6)
-_MOTOR_ENERGY, _CONTACT_ENERGY = _layout.vector(2), _layout.vector(2)  # A, Q
+_AVAILABLE_MOTOR_ENERGY, _ENERGY_IN_CONTACT = _layout.vector(2), _layout.vector(2)  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
 _CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
-_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _SLAVE_DEPTH = (_layout.number() for _ in range(4))
-# Fit of k and b: filtered force; force and speed at the start of the stretch; its length and the
+_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
+    _layout.number() for _ in range(4)
+)
+# Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _STRETCH_START_FORCE, _STRETCH_START_SPEED = (_layout.number() for _ in range(3))
-_STRETCH_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_LENGTH = (_layout.number() for _ in range(3))
-_FIT_SUMS = _layout.vector(NUM_FIT_SUMS)
+_FILTERED_FORCE, _FIT_SAMPLE_START_FORCE, _FIT_SAMPLE_START_SPEED = (
+    _layout.number() for _ in range(3)
+)
+_FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
+_FIT_SUMS = _layout.vector(NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
-_CONTACT_WRENCH, _FILTERED_LOAD = _layout.vector(6), _layout.vector(6)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _STEP_PERIOD = (
+    _layout.number() for _ in range(4)
+)
+_CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
-_DISPLAYED_FORCE, _LAST_INWARD_SPEED, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
+_RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
 
 
 @njit(cache=True)
 def filter_velocity(twist, share, memory):
     """Low-pass filter the velocity in `memory`; `share` is the weight of the new `twist`."""
-    velocity = memory[OWN_VELOCITY]
+    velocity = memory[FILTERED_OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
 
@@ -145,7 +158,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 
     The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
     """
-    mean, normal = memory[MEAN_WRENCH], memory[CONTACT_DIRECTION]
+    mean, normal = memory[MEAN_CONTACT_WRENCH], memory[CONTACT_DIRECTION]
     rate = 1.0
     if memory[IN_CONTACT] > 0.0:
         # A wrench far above the mean, which may be noise, replaces it at once.
@@ -163,7 +176,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 
 
 @njit(cache=True)
-def receive_energy(g, received, memory):
+def add_received_energy(g, received, memory):
     """Add newly received energy to this end's balance for group `g`; return it [J]."""
     new = credit_new_energy(g, received, memory)
     memory[STORED_ENERGY][g] += new
@@ -174,15 +187,19 @@ def receive_energy(g, received, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = has_arrived(received)
-    memory[_PERIOD] = T
+    memory[_STEP_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
-    kept = 1.0 - T / _MAXIMA_DECAY_S
+    kept = 1.0 - T / _LONGEST_DELAY_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
-    filter_velocity(twist, min(T / _MEASUREMENT_FILTER_S, 1.0), memory)
-    contact, load, filtered = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_FILTERED_LOAD]
+    filter_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
+    contact, load, filtered = (
+        memory[_CONTACT_WRENCH],
+        memory[LOAD_WRENCH],
+        memory[_FILTERED_LOAD_WRENCH],
+    )
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
@@ -208,7 +225,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     fill_packet(memory[SERVO_MODEL_POSE], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
         normal = memory[CONTACT_DIRECTION]
-        correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, normal, p)
+        correction = memory[_RENDERED_FORCE] - wrench_component_along(contact, normal, p)
         for i in range(6):
             packet[WRENCH][i] += correction * normal[i]
     copy_into(packet, PACKET_LOAD_WRENCH.start, filtered, 0, 6)
@@ -216,21 +233,21 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         size = length_of_group(memory[CONTACT_DIRECTION], g)
         compliance += size * size / (_SERVO_STIFFNESS_FACTOR * p[SERVO_K][g])
-        packet[ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
-    packet[CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
+        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[PACKET_LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
+    packet[PACKET_CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
     packet[ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
-    packet[CONTACT_STIFFNESS] = memory[_DISPLAYED_SHARE] * k / (1.0 + k * compliance)
+    packet[PACKET_CONTACT_STIFFNESS] = memory[_STIFFNESS_SHARE] * k / (1.0 + k * compliance)
 
 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_WRENCH], dx, g))
-    new = receive_energy(g, received, memory)
+    new = add_received_energy(g, received, memory)
     ledger, input_energy, reserve = (
         memory[STORED_ENERGY],
-        memory[_CONTACT_ENERGY],
+        memory[_ENERGY_IN_CONTACT],
         p[SLAVE_RESERVE][g],
     )
     ledger[g] += work
@@ -238,20 +255,24 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     speed = length_of_group(twist, g)
     kinetic = 0.5 * SLAVE_MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
-    keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
-    free, missing, returned = ledger[g] - kinetic, hold - _master_level(g, received, memory), 0.0
+    keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
+    free, missing, returned = (
+        ledger[g] - kinetic,
+        hold - _master_ledger_level(g, received, memory),
+        0.0,
+    )
     needed = missing
-    if in_contact and speed < _REST_SPEED * ANGLE_PER_LENGTH[g]:
-        keep, rate = (1.0 - SHARED_RESERVE_SHARE) * reserve, _REST_SEND_RATE
-        needed += SHARED_RESERVE_SHARE * reserve
-        returned = min(free - _MIN_KEPT_RESERVE_SHARE * reserve, missing)
+    if in_contact and speed < _SLAVE_REST_SPEED * ANGLE_PER_LENGTH[g]:
+        keep, rate = (1.0 - RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
+        needed += RESERVE_SHARE_AT_MASTER * reserve
+        returned = min(free - _MIN_KEPT_SLAVE_RESERVE_SHARE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
-    lost = max(ledger[g] - returned - _MAX_ENERGY_IN_RESERVES * reserve, 0.0)
+    lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_IN_RESERVES * reserve, 0.0)
     memory[SENT_ENERGY][g] += returned
     memory[DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
-    memory[_MOTOR_ENERGY][g] = ledger[g] - kinetic
+    memory[_AVAILABLE_MOTOR_ENERGY][g] = ledger[g] - kinetic
 
 
 @njit(cache=True)
@@ -260,9 +281,9 @@ def _servo_lag_s(p):
 
 
 @njit(cache=True)
-def _master_level(g, received, memory):
+def _master_ledger_level(g, received, memory):
     """Return the level of the master's ledger [J], with what is in transit to it."""
-    return received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
+    return received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
 
 
 @njit(cache=True)
@@ -275,101 +296,108 @@ def _max_displayed_stiffness(received, T, p, memory):
             p[MASTER_RESERVE][g],
         )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
-        level = min(max(_master_level(g, received, memory) / reserve, 0.0), 1.0)
+        level = min(max(_master_ledger_level(g, received, memory) / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
-        _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
+        _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
     )
-    max_silence = min(max_silence, _MAX_SILENCE_S)
+    max_silence = min(max_silence, _MAX_SILENCE_FOR_GAIN_S)
     goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
         goal = min(goal, 0.0)
     if memory[IN_CONTACT] == 0.0:
-        memory[_EXTRA_GAIN] = 0.0
+        memory[_GAIN_MINUS_ONE] = 0.0
     else:
-        change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_EXTRA_GAIN]
-        memory[_EXTRA_GAIN] += T / (_GAIN_RISE_S if change > 0.0 else _GAIN_FALL_S) * change
-    gain = 1.0 + memory[_EXTRA_GAIN]
+        change = max(goal, _MIN_STIFFNESS_GAIN - 1.0) - memory[_GAIN_MINUS_ONE]
+        memory[_GAIN_MINUS_ONE] += (
+            T / (_STIFFNESS_GAIN_RISE_S if change > 0.0 else _STIFFNESS_GAIN_FALL_S) * change
+        )
+    gain = 1.0 + memory[_GAIN_MINUS_ONE]
     least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
     return max(least, min(gain * base, _MAX_DISPLAYED_STIFFNESS))
 
 
 @njit(cache=True)
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
-    normal, velocity = memory[CONTACT_DIRECTION], memory[OWN_VELOCITY]
+    normal, velocity = memory[CONTACT_DIRECTION], memory[FILTERED_OWN_VELOCITY]
     k = memory[_CONTACT_STIFFNESS]
     if not in_contact:
         if memory[IN_CONTACT] > 0.0 and _is_wall_removed(dx, memory):
-            memory[_DISPLAYED_SHARE] = 0.0
+            memory[_STIFFNESS_SHARE] = 0.0
         memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
     max_slip = _max_slip_force_change(wrench, size, T, p, memory)
-    inward, rate = -work_along(normal, dx), min(T / _MEASUREMENT_FILTER_S, 1.0)
+    inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
         # Start at the first sample in contact, because the step to it was partly outside.
-        memory[_FILTERED_FORCE] = memory[_STRETCH_START_FORCE] = memory[_DISPLAYED_FORCE] = size
+        memory[_FILTERED_FORCE] = memory[_FIT_SAMPLE_START_FORCE] = memory[_RENDERED_FORCE] = size
         memory[_DISPLACEMENT_FILTER_LAG] = inward
-        memory[_STRETCH_START_SPEED] = memory[_LAST_INWARD_SPEED] = speed
-        memory[_STRETCH_LENGTH] = memory[_FIT_LENGTH] = 0.0
-        memory[_DISPLAYED_SHARE] = memory[_SHARE_GOAL] = k_d / max(k, k_d)
+        memory[_FIT_SAMPLE_START_SPEED] = memory[_LAST_SPEED_INTO_WALL] = speed
+        memory[_FIT_SAMPLE_LENGTH] = memory[_FIT_SPAN] = 0.0
+        memory[_STIFFNESS_SHARE] = memory[_STIFFNESS_SHARE_GOAL] = k_d / max(k, k_d)
     filtered_step = rate * (inward - memory[_DISPLACEMENT_FILTER_LAG])
     memory[_DISPLACEMENT_FILTER_LAG] += filtered_step - inward
-    memory[_STRETCH_LENGTH] += filtered_step
+    memory[_FIT_SAMPLE_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
     fastest = math.hypot(
         length_of_group(velocity, 0), length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
     )
-    slow, length_m = fastest < _FAST_FIT_SPEED, abs(memory[_STRETCH_LENGTH])
-    if length_m > (_STRETCH_M if slow else _FAST_STRETCH_M):
-        memory[_FIT_LENGTH] = min(memory[_FIT_LENGTH] + length_m, _MAX_FIT_M)
-        keep = max(1.0 - length_m / max(memory[_FIT_LENGTH], _MIN_FIT_M), 0.0) if slow else 0.5
-        speed_change = speed - memory[_STRETCH_START_SPEED]
-        stretch, damping = memory[_STRETCH_LENGTH], memory[_CONTACT_DAMPING]
-        change = memory[_FILTERED_FORCE] - memory[_STRETCH_START_FORCE] - damping * speed_change
+    slow, length_m = fastest < _FAST_FIT_SPEED, abs(memory[_FIT_SAMPLE_LENGTH])
+    if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
+        memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
+        keep = max(1.0 - length_m / max(memory[_FIT_SPAN], _MIN_FIT_SPAN_M), 0.0) if slow else 0.5
+        speed_change = speed - memory[_FIT_SAMPLE_START_SPEED]
+        stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
+        change = memory[_FILTERED_FORCE] - memory[_FIT_SAMPLE_START_FORCE] - damping * speed_change
         change -= force_change_by_slip(
             change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip
         )
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
-        memory[_STRETCH_LENGTH], memory[_STRETCH_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
-        memory[_STRETCH_START_SPEED] = speed
+        memory[_FIT_SAMPLE_LENGTH], memory[_FIT_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
+        memory[_FIT_SAMPLE_START_SPEED] = speed
     if k > 1.0:  # N/m
-        rate, goal = min(T / _SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
-        if abs(goal - memory[_SHARE_GOAL]) > _SHARE_DEADBAND * memory[_SHARE_GOAL]:
-            memory[_SHARE_GOAL] = goal
-        memory[_DISPLAYED_SHARE] += rate * (memory[_SHARE_GOAL] - memory[_DISPLAYED_SHARE])
+        rate, goal = min(T / _STIFFNESS_SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
+        if (
+            abs(goal - memory[_STIFFNESS_SHARE_GOAL])
+            > _STIFFNESS_SHARE_DEADBAND * memory[_STIFFNESS_SHARE_GOAL]
+        ):
+            memory[_STIFFNESS_SHARE_GOAL] = goal
+        memory[_STIFFNESS_SHARE] += rate * (
+            memory[_STIFFNESS_SHARE_GOAL] - memory[_STIFFNESS_SHARE]
+        )
         depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
         if memory[IN_CONTACT] == 0.0:
-            memory[_SLAVE_DEPTH] = depth
-        memory[_SLAVE_DEPTH] += inward + rate * (depth - memory[_SLAVE_DEPTH] - inward)
+            memory[_SLAVE_WALL_DEPTH] = depth
+        memory[_SLAVE_WALL_DEPTH] += inward + rate * (depth - memory[_SLAVE_WALL_DEPTH] - inward)
         memory[IN_CONTACT] = 1.0
     explained = memory[_CONTACT_STIFFNESS] * inward
-    explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_INWARD_SPEED])
-    rate = T / _SLIP_FORCE_FADE_S + abs(inward) / _MIN_FIT_M
-    shown = force_without_slip_steps(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
-    memory[_DISPLAYED_FORCE] = shown
-    memory[_LAST_INWARD_SPEED] = speed
+    explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED_INTO_WALL])
+    rate = T / _SLIP_FORCE_FADE_S + abs(inward) / _MIN_FIT_SPAN_M
+    shown = force_without_slip_steps(memory[_RENDERED_FORCE], size, explained, rate, max_slip)
+    memory[_RENDERED_FORCE] = shown
+    memory[_LAST_SPEED_INTO_WALL] = speed
 
 
 @njit(cache=True)
 def _is_wall_removed(dx, memory):
     normal = memory[CONTACT_DIRECTION]
-    speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_INWARD_SPEED]
+    speed_change = work_along(normal, memory[FILTERED_OWN_VELOCITY]) + memory[_LAST_SPEED_INTO_WALL]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
     explained += abs(memory[_CONTACT_DAMPING] * speed_change)
-    return memory[_DISPLAYED_FORCE] > max(_MIN_REMOVED_WALL_FORCE_N, 2.0 * explained)
+    return memory[_RENDERED_FORCE] > max(_MIN_REMOVED_WALL_FORCE_N, 2.0 * explained)
 
 
 @njit(cache=True)
 def _max_slip_force_change(wrench, size, T, p, memory):
-    mean_wrench = memory[MEAN_WRENCH]
+    mean_wrench = memory[MEAN_CONTACT_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - size * size, 0.0))
-    largest = max(memory[_MAX_FRICTION_FORCE] * (1.0 - min(T / _FRICTION_MEMORY_S, 1.0)), friction)
+    largest = max(memory[_MAX_FRICTION_FORCE] * (1.0 - min(T / _FRICTION_DECAY_S, 1.0)), friction)
     memory[_MAX_FRICTION_FORCE] = largest
     return largest * min(largest / mean, 1.0)
 
@@ -379,15 +407,18 @@ def _generate_command(received, connected, T, p, memory, error):
     velocity, normal, feed = memory[COMMAND_TWIST], memory[CONTACT_DIRECTION], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
-        beyond_wall = memory[_SLAVE_DEPTH] - work_along(normal, error)
+        beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
-            compliance, inward_speed = 1.0 - memory[_DISPLAYED_SHARE], -work_along(normal, feed)
+            compliance, inward_speed = 1.0 - memory[_STIFFNESS_SHARE], -work_along(normal, feed)
     feeds_forward = connected and memory[_SILENCE_TIME] < _MAX_FEEDFORWARD_SILENCE_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
-        distance, acceleration = length_of_group(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
+        distance, acceleration = (
+            length_of_group(error, g),
+            _MAX_COMMAND_ACCELERATION * ANGLE_PER_LENGTH[g],
+        )
         rate = 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
             rate = min(rate, _STOPPING_SPEED_FACTOR * math.sqrt(2.0 * acceleration / distance))
@@ -431,15 +462,15 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _limit_motor_wrench(g, damping, twist, p, memory):
-    motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
+    motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed, mass = (
         length_of_group(motor_wrench, g),
         length_of_group(twist, g),
         SLAVE_MASS_FACTOR * p[SLAVE_MASS][g],
     )
-    stands = length_of_group(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
-    margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_MOTOR_ENERGY][g]
+    stands = length_of_group(velocity, g) < _SLAVE_STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
+    margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_AVAILABLE_MOTOR_ENERGY][g]
     changed = False
     pushes = (
         dot_of_group(motor_wrench, twist, g) > 0.0 or dot_of_group(motor_wrench, velocity, g) > 0.0
@@ -447,22 +478,22 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free, k = (
-            _FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
+            _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
             memory[_CONTACT_STIFFNESS],
         )
-        spring = (1.0 + memory[_EXTRA_GAIN]) * free * free / (2.0 * max(k, 1.0))
-        available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_CONTACT_ENERGY][g])
+        spring = (1.0 + memory[_GAIN_MINUS_ONE]) * free * free / (2.0 * max(k, 1.0))
+        available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_ENERGY_IN_CONTACT][g])
         if stands or not pushes:
             # Delayed motors gain a little energy at standstill; with an empty balance they yield.
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
         permitted += mass * speed / _MOTOR_ENERGY_HORIZON_S  # stops without a rebound
-    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+    reach = _MOTOR_ENERGY_HORIZON_S * (speed + memory[_STEP_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True
     if balance < margin and not stands:
-        strongest = mass * _MAX_BRAKE_DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
+        strongest = mass * _MAX_SLAVE_DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
         brake = min(damping * speed, strongest)
         if -brake * speed < dot_of_group(motor_wrench, twist, g):
             for i in range(3 * g, 3 * g + 3):

@@ -40,10 +40,10 @@ LAST_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
 LOAD_WRENCH = _layout.vector(6)  #: part of the slave's wrench from its load's weight and inertia
 COMMAND = _layout.vector(13)  #: slave's command since the last step: pose X_WS, twist
 #: Remaining time in which the slave keeps its command while a new channel fills [s].
-CHANNEL_FILL_TIME = _layout.number()
-HAND_VELOCITY = _layout.vector(6)  #: filtered twist at the master, see `retreat`
-LAST_PACKET = _layout.vector(38)  #: last sent packet, see `packet`
-_METHOD_MEMORY = _layout.rest()
+CHANNEL_FILL_TIME_LEFT = _layout.number()
+FILTERED_HAND_VELOCITY = _layout.vector(6)  #: filtered twist at the master, see `retreat`
+LAST_HEALTHY_PACKET = _layout.vector(38)  #: last sent packet, see `packet`
+_METHOD_MEMORY_SLICE = _layout.rest()
 _command_layout = SlotAllocator(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command_layout.vector(7), _command_layout.rest()
 
@@ -61,13 +61,13 @@ MOTION_SCALE = _parameter_layout.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
 #: [m/s, rad/s].
 RETREAT_SPEED = _parameter_layout.vector(2)
-_METHOD_PARAMETERS = _parameter_layout.rest()
+_METHOD_PARAMETER_SLICE = _parameter_layout.rest()
 
 
 def own_memory() -> SlotAllocator:
     """Return an allocator for a method's own part of the memory, which starts with zeros."""
-    return SlotAllocator(MEMORY_SIZE, _METHOD_MEMORY.start)
+    return SlotAllocator(MEMORY_SIZE, _METHOD_MEMORY_SLICE.start)
 
 
 def own_parameters() -> SlotAllocator:
-    return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETERS.start)
+    return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETER_SLICE.start)

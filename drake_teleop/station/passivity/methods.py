@@ -45,7 +45,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    LAST_PACKET,
+    LAST_HEALTHY_PACKET,
     MEMORY_SIZE,
     MOTION_SCALE,
     NUM_PARAMETERS,
@@ -57,10 +57,10 @@ from drake_teleop.station.passivity.memory import (
     WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.packet import (
-    INPUTS_FINITE,
     PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
+    SENDER_INPUTS_FINITE,
     is_vector_finite,
 )
 from drake_teleop.station.passivity.pspm import PspmConfig
@@ -156,7 +156,7 @@ class MethodConfigs:
     )
 
 
-_FIELD_OF_METHOD = {
+_CONFIG_FIELD_OF_METHOD = {
     entry.metadata.get("method", entry.name): entry.name for entry in fields(MethodConfigs)
 }
 
@@ -227,8 +227,8 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
                     remedy="leave them out; a shipped method has its own block of parameters",
                 )
             return (
-                getattr(self, _FIELD_OF_METHOD[self.method])
-                if self.method in _FIELD_OF_METHOD
+                getattr(self, _CONFIG_FIELD_OF_METHOD[self.method])
+                if self.method in _CONFIG_FIELD_OF_METHOD
                 else None
             )
         for name in self.registered:
@@ -276,7 +276,7 @@ def initial_method_memory(
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY_SIZE)
     memory[COMMAND_POSE] = pose
-    memory[LAST_PACKET][POSE] = pose
+    memory[LAST_HEALTHY_PACKET][POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -305,11 +305,11 @@ _call_master_step, _call_slave_step, _call_record_command = map(
 
 def step_addresses(method: str) -> tuple[int, int, int]:
     """Return the addresses of a method's compiled functions: master, slave, record."""
-    return _addresses_of_steps(*METHODS[method][:3])
+    return _addresses_of_compiled_steps(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_steps(*steps: Any) -> tuple[int, int, int]:
+def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, int, int]:
     master, slave, sent = zip(
         steps, (_MASTER_ARGUMENT_TYPES, _SLAVE_ARGUMENT_TYPES, _RECORD_ARGUMENT_TYPES), strict=True
     )
@@ -317,13 +317,13 @@ def _addresses_of_steps(*steps: Any) -> tuple[int, int, int]:
 
 
 @njit(cache=True)
-def _complete_packet(healthy, memory, packet):
+def _set_packet_number_and_health(healthy, memory, packet):
     if healthy:
-        packet[INPUTS_FINITE] = 1.0
-        copy_into(memory, LAST_PACKET.start, packet, 0, PACKET_SIZE)
+        packet[SENDER_INPUTS_FINITE] = 1.0
+        copy_into(memory, LAST_HEALTHY_PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, LAST_PACKET.start, PACKET_SIZE)
-        packet[INPUTS_FINITE] = 0.0
+        copy_into(packet, 0, memory, LAST_HEALTHY_PACKET.start, PACKET_SIZE)
+        packet[SENDER_INPUTS_FINITE] = 0.0
     packet[PACKET_NUMBER] = memory[STEP_COUNT]
     memory[STEP_COUNT] += 1.0
 
@@ -362,7 +362,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
-    _complete_packet(healthy, memory, packet)
+    _set_packet_number_and_health(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -392,7 +392,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _call_slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _complete_packet(healthy, memory, packet)
+    _set_packet_number_and_health(healthy, memory, packet)
 
 
 @njit(cache=True)

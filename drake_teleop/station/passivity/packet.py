@@ -22,7 +22,7 @@ _layout = SlotAllocator(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
 PACKET_NUMBER = _layout.number()
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
-INPUTS_FINITE = _layout.number()
+SENDER_INPUTS_FINITE = _layout.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
 POSE = _layout.vector(7)
 #: Twist of the sender [v; omega], in W.
@@ -32,7 +32,7 @@ WRENCH = _layout.vector(6)
 #: Cumulative integral; the method defines it.
 INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
-ENERGY = _layout.vector(2)
+CUMULATIVE_ENERGY = _layout.vector(2)
 #: Second energy counter, by group [J].
 SECOND_ENERGY_COUNTER = _layout.vector(2)
 #: 1 while the slave's detector reports contact.
@@ -42,7 +42,7 @@ CONTACT_FLAG = _layout.number()
 PACKET_LOAD_WRENCH = _layout.vector(6)
 
 #: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
-MAX_WRENCH_RATE = (450.0, 4.5)
+MAX_HAND_WRENCH_RATE = (450.0, 4.5)
 
 
 @njit(cache=True)
@@ -55,7 +55,7 @@ def has_arrived(received):
 @njit(cache=True)
 def credit_new_energy(g, received, memory):
     """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
-    new = max(received[ENERGY][g] - memory[RECEIVED_ENERGY][g], 0.0)
+    new = max(received[CUMULATIVE_ENERGY][g] - memory[RECEIVED_ENERGY][g], 0.0)
     memory[RECEIVED_ENERGY][g] += new
     return new
 

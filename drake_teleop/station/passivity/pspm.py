@@ -27,7 +27,7 @@ from drake_teleop.station.passivity.memory import (
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     POSE,
     VELOCITY,
     WRENCH,
@@ -42,11 +42,11 @@ from drake_teleop.station.passivity.packet import (
 
 # Parameters, for translation and rotation.
 _layout = own_parameters()
-_INITIAL_ENERGY, _MAX_ENERGY = _layout.vector(2), _layout.vector(2)
+_INITIAL_ENERGY, _MAX_STORED_ENERGY = _layout.vector(2), _layout.vector(2)
 _SPRING_STIFFNESS, _HAND_DAMPING = _layout.vector(2), _layout.vector(2)
 # Memory: set position minus actual position; requested value of this offset.
 _layout = own_memory()
-_SPRING_DEFLECTION, _REQUESTED_DEFLECTION = _layout.vector(6), _layout.vector(6)
+_SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.vector(6)
 
 
 @settings
@@ -70,7 +70,7 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_INITIAL_ENERGY], p[_MAX_ENERGY] = self.initial, self.ceiling
+        p[_INITIAL_ENERGY], p[_MAX_STORED_ENERGY] = self.initial, self.ceiling
         p[_SPRING_STIFFNESS], p[_HAND_DAMPING] = self.stiffness, self.damping
 
 
@@ -81,7 +81,7 @@ def initialize(p, memory):
 
 @njit(cache=True)
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
     damped = -dot_of_group(memory[LAST_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
     ledger = memory[STORED_ENERGY]
@@ -92,18 +92,18 @@ def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memor
     for i in range(3 * g, 3 * g + 3):
         offset[i] = share * requested[i]
     energy -= 0.5 * stiffness * (dot_of_group(offset, offset, g) - stored)
-    surplus = max(energy - p[_MAX_ENERGY][g], 0.0)
+    surplus = max(energy - p[_MAX_STORED_ENERGY][g], 0.0)
     if shuffle:
         memory[SENT_ENERGY][g] += surplus
     else:
         memory[DISSIPATED_ENERGY][g] += surplus
     ledger[g] = energy - surplus
-    packet[ENERGY][g] = memory[SENT_ENERGY][g]
+    packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     received_wrench, K, B = received[WRENCH], p[_SPRING_STIFFNESS], p[_HAND_DAMPING]
     for g in range(2):
         before = dot_of_group(offset, offset, g)
@@ -123,7 +123,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_DEFLECTION]
+    offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     now, held, K, D = memory[COMMAND_POSE], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
-    HAND_VELOCITY,
+    FILTERED_HAND_VELOCITY,
     LAST_WRENCH,
     RETREAT_SPEED,
     SLAVE_MASS,
@@ -34,16 +34,16 @@ MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor state
 # Monitor state of the master.
 _layout = SlotAllocator(MASTER_MONITOR_SIZE)
 SILENCE_TIME = _layout.number()  #: time without packets [s], also at the slave
-_PRESENT_WRENCH_LIMITS = _layout.vector(2)  # present limits
-_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
+_PRESENT_HAND_WRENCH_LIMITS = _layout.vector(2)  # present limits
+_WRENCH_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
 _CONNECTED_TIME = _layout.number()  # time since the last silence
 # Monitor state of the slave.
 _layout = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME + 1)
-_STOPPING_TIME = _layout.number()  # time since it began to stop
-_RESUMING_TIME = _layout.number()  # time since it began to resume
-_STOP_POSE = _layout.vector(7)  # command when it began to stop
-_STOP_VELOCITY = _layout.vector(6)  # its velocity
-_LAST_COMMAND, _PREVIOUS_COMMAND = _layout.vector(7), _layout.vector(7)
+_TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
+_TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
+_COMMAND_AT_STOP_START = _layout.vector(7)  # command when it began to stop
+_COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
+_LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
 
 def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -55,7 +55,7 @@ def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[n
     if full is None:
         watch[SILENCE_TIME] = np.inf
     else:
-        watch[_PRESENT_WRENCH_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
+        watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
     return watch
 
 
@@ -63,7 +63,7 @@ def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_TIME] = np.inf
-    for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
+    for part in (_COMMAND_AT_STOP_START, _LAST_COMMAND, _COMMAND_BEFORE_LAST):
         watch[part] = pose
     return watch
 
@@ -88,7 +88,7 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     _update_silence_time(alive, fault, T, watch)
     connected = watch[SILENCE_TIME] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
-    present, fall = watch[_PRESENT_WRENCH_LIMITS], watch[_LIMIT_FALL_RATE]
+    present, fall = watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_WRENCH_LIMIT_FALL_RATE]
     for g in range(2):
         size, limit = length_of_group(held, g), present[g]
         if connected:
@@ -111,28 +111,28 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     `master_limits_into`.
     """
     _update_silence_time(alive, fault, T, watch)
-    last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
-    start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
+    last, before = watch[_LAST_COMMAND], watch[_COMMAND_BEFORE_LAST]
+    start, velocity = watch[_COMMAND_AT_STOP_START], watch[_COMMAND_VELOCITY_AT_STOP_START]
     step = np.empty(6)
     if watch[SILENCE_TIME] <= timeout:
-        watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME_S)
-    elif watch[_RESUMING_TIME] > 0.0:
+        watch[_TIME_SINCE_RESUME_BEGAN] = min(watch[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
+    elif watch[_TIME_SINCE_RESUME_BEGAN] > 0.0:
         pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
-        watch[_STOPPING_TIME] = watch[_RESUMING_TIME] = 0.0
-    if watch[_RESUMING_TIME] == RESUME_TIME_S:
+        watch[_TIME_SINCE_STOP_BEGAN] = watch[_TIME_SINCE_RESUME_BEGAN] = 0.0
+    if watch[_TIME_SINCE_RESUME_BEGAN] == RESUME_TIME_S:
         copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
-        watch[_STOPPING_TIME] += T
-        u = min(watch[_STOPPING_TIME] / STOP_TIME_S, 1.0)
+        watch[_TIME_SINCE_STOP_BEGAN] += T
+        u = min(watch[_TIME_SINCE_STOP_BEGAN] / STOP_TIME_S, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP_TIME_S * u * (1.0 - u * u * (1.0 - 0.5 * u))
         move_pose_into(start, step, command)
-        u = watch[_RESUMING_TIME] / RESUME_TIME_S
+        u = watch[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
         if u > 0.0:
             pose_difference_into(requested, command, step)
             for i in range(6):
@@ -148,7 +148,7 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
 
     It falls to 0 for hand speeds along the wrench between `RETREAT_SPEED` and twice this.
     """
-    velocity, rate = memory[HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
+    velocity, rate = memory[FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):

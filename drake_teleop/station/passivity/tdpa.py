@@ -31,9 +31,9 @@ from drake_teleop.station.passivity.memory import (
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     INTEGRAL,
-    MAX_WRENCH_RATE,
+    MAX_HAND_WRENCH_RATE,
     PACKET_NUMBER,
     POSE,
     SECOND_ENERGY_COUNTER,
@@ -50,34 +50,38 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_RESERVED_INPUT_SHARE = 0.5
+_KEPT_HAND_INPUT_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_SLOW_ONSET_S = 0.1
+_SLOW_WRENCH_ONSET_S = 0.1
 _WRENCH_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
-_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
+_WRENCH_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
-_STIFFNESS_TRAVEL = (1e-3, 1e-2)
-_FULL_DRAG_SPEED = (0.02, 0.2)
+_STIFFNESS_AVERAGING_TRAVEL = (1e-3, 1e-2)
+_FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET, _SLAVE_STORED_ENERGY = INTEGRAL.start, SECOND_ENERGY_COUNTER
+_NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = INTEGRAL.start, SECOND_ENERGY_COUNTER
 
 # Parameters; reserve, drag and stiffness in the master's power units.
 _layout = own_parameters()
-_RELEASE_TIME, _DRAIN_RATE, _DRIFT_RATE = _layout.number(), _layout.number(), _layout.number()
+_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (
+    _layout.number(),
+    _layout.number(),
+    _layout.number(),
+)
 _TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
 _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _layout = own_memory()
-_WITHHELD_SHARE, _RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
+_WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _layout = own_memory()
-_WORK_IN, _WORK_OUT = _layout.vector(2), _layout.vector(2)
+_SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
 _COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
-_WITHHELD_COMMAND, _FILTERED_WRENCH = _layout.vector(6), _layout.vector(6)
-_STIFFNESS_ESTIMATE, _ONSET_PACKET = _layout.vector(2), _layout.vector(2)
+_WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
+_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET = _layout.vector(2), _layout.vector(2)
 _LAST_COMMAND = _layout.vector(7)  # the command of the last step
 
 
@@ -125,8 +129,8 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_RELEASE_TIME], p[_DRAIN_RATE] = self.release, self.drain_rate
-        p[_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
+        p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate
+        p[_COMMAND_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
         p[_TARGET_RESERVE], p[_DRAG_WRENCH] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
 
@@ -140,15 +144,15 @@ def charged_tdpa_config() -> TdpaConfig:
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     for g in range(2):
         memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
-    drain = min(T * p[_DRAIN_RATE], 1.0)
-    release = T / p[_RELEASE_TIME] if p[_RELEASE_TIME] > 0.0 else 1.0
+    drain = min(T * p[_LEDGER_DRAIN_RATE], 1.0)
+    release = T / p[_WRENCH_RELEASE_TIME] if p[_WRENCH_RELEASE_TIME] > 0.0 else 1.0
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
     ledger, kept, withheld = (
         memory[STORED_ENERGY],
-        memory[_RESERVED_ENERGY],
-        memory[_WITHHELD_SHARE],
+        memory[_MASTER_RESERVED_ENERGY],
+        memory[_WITHHELD_WRENCH_SHARE],
     )
     for g in range(2):
         limit_group(wrench, g, limits[g])
@@ -162,11 +166,11 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         withheld[g] = 1.0 - share
         memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
         scale_group(wrench, g, share)
-        _add_drag_force(g, received[_SLAVE_STORED_ENERGY][g], dx, limits, T, p, memory, wrench)
-        _balance_hand_work(g, dot_of_group(wrench, dx, g), p, memory)
+        _add_drag_force(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
+        _charge_hand_work_to_ledger(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             _send_surplus_energy(g, p, memory)
-        packet[ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
@@ -175,7 +179,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench):
     least, size = (
-        length_of_group(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
+        length_of_group(held, g) - MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
         length_of_group(wrench, g),
     )
     share = min(share, max(drain * stored / drained, least / size))
@@ -184,9 +188,9 @@ def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench
 
 @njit(cache=True)
 def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    drag, level = p[_DRAG_WRENCH][g], memory[STORED_ENERGY][g] + memory[_RESERVED_ENERGY][g]
+    drag, level = p[_DRAG_WRENCH][g], memory[STORED_ENERGY][g] + memory[_MASTER_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_TARGET_RESERVE][g]:
-        damping = drag / max(length_of_group(dx, g), _FULL_DRAG_SPEED[g] * T)
+        damping = drag / max(length_of_group(dx, g), _FULL_DRAG_HAND_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
         limit_group(wrench, g, limits[g])
@@ -195,20 +199,20 @@ def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
 @njit(cache=True)
 def _send_surplus_energy(g, p, memory):
     ledger = memory[STORED_ENERGY]
-    surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_TARGET_RESERVE][g]
+    surplus = ledger[g] + memory[_MASTER_RESERVED_ENERGY][g] - p[_TARGET_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
     ledger[g] -= surplus
     memory[SENT_ENERGY][g] += surplus
 
 
 @njit(cache=True)
-def _balance_hand_work(g, drained, p, memory):
-    ledger, kept = memory[STORED_ENERGY], memory[_RESERVED_ENERGY]
+def _charge_hand_work_to_ledger(g, drained, p, memory):
+    ledger, kept = memory[STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
-        more = min(-_RESERVED_INPUT_SHARE * drained, max(p[_TARGET_RESERVE][g] - kept[g], 0.0))
+        more = min(-_KEPT_HAND_INPUT_SHARE * drained, max(p[_TARGET_RESERVE][g] - kept[g], 0.0))
         memory[SENT_ENERGY][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -220,27 +224,27 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot_of_group(wrench, dx, g)
-        memory[_WORK_IN][g] += max(work, 0.0)
-        memory[_WORK_OUT][g] += max(-work, 0.0)
+        memory[_SLAVE_WORK_IN][g] += max(work, 0.0)
+        memory[_SLAVE_WORK_OUT][g] += max(-work, 0.0)
     if has_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
         available = _energy_available_to_slave(memory, g)
-        credit = min(memory[_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
+        credit = min(memory[_SLAVE_WORK_IN][g], memory[_COMMAND_WORK_IN][g]) + min(available, 0.0)
         # Output beyond the received energy is compensated before energy is sent.
         memory[SENT_ENERGY][g] = max(memory[SENT_ENERGY][g], credit)
         memory[STORED_ENERGY][g] = available
-        packet[ENERGY][g] = memory[SENT_ENERGY][g]
-        packet[_SLAVE_STORED_ENERGY][g] = memory[STORED_ENERGY][g]
+        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[_PACKET_SLAVE_ENERGY][g] = memory[STORED_ENERGY][g]
         _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
-    fill_packet(pose, twist, memory[_FILTERED_WRENCH], packet)
+    fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
 
 
 @njit(cache=True)
 def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
-    filtered, hand = memory[_FILTERED_WRENCH], p[_HAND_STIFFNESS][g]
+    filtered, hand = memory[_FILTERED_SLAVE_WRENCH], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
         gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
@@ -248,15 +252,18 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
         round_trip = max(memory[STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
         lag = round_trip + p[SERVO_D][g] / p[SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _SLOW_ONSET_S, 1.0)
+        onset_rate = min(T / _SLOW_WRENCH_ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
         if size < _WRENCH_END_SHARE * filtered_size:
             rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _ONSET_COMPLETE_SHARE * size:
+            if filtered_size * (1.0 + gain) < _WRENCH_ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
-                memory[_ONSET_PACKET][g] = memory[STEP_COUNT]
-            if lag > _SLOW_ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
+                memory[_QUICK_ONSET_PACKET][g] = memory[STEP_COUNT]
+            if (
+                lag > _SLOW_WRENCH_ONSET_S
+                and received[_NEWEST_MASTER_PACKET] < memory[_QUICK_ONSET_PACKET][g]
+            ):
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -265,24 +272,26 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _estimate_contact_stiffness(g, dx, wrench, T, memory):
-    size, stiffness = length_of_group(dx, g), memory[_STIFFNESS_ESTIMATE]
-    if size > _STIFFNESS_TRAVEL[g] * T:
+    size, stiffness = length_of_group(dx, g), memory[_CONTACT_STIFFNESS_ESTIMATE]
+    if size > _STIFFNESS_AVERAGING_TRAVEL[g] * T:
         change = dot_of_group(wrench, dx, g) - dot_of_group(memory[LAST_WRENCH], dx, g)
-        forget = min(size / _STIFFNESS_TRAVEL[g], 1.0)
+        forget = min(size / _STIFFNESS_AVERAGING_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
 
 
 @njit(cache=True)
 def _energy_available_to_slave(memory, g):
-    return memory[RECEIVED_ENERGY][g] - max(memory[_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g])
+    return memory[RECEIVED_ENERGY][g] - max(
+        memory[_SLAVE_WORK_OUT][g], memory[_COMMAND_WORK_OUT][g]
+    )
 
 
 @njit(cache=True)
 def _advance_command(received, wrench, T, p, memory):
-    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD_COMMAND]
+    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD_COMMAND_MOTION]
     step = memory[COMMAND_TWIST]
-    remaining_share = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
+    remaining_share = 1.0 - min(T * p[_COMMAND_DRIFT_RATE], 1.0)
     pose_difference_into(received[POSE], now, step)
     for i in range(6):
         step[i] -= remaining_share * withheld[i]

@@ -27,7 +27,7 @@ from drake_teleop.station.passivity.memory import (
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     POSE,
     VELOCITY,
     WRENCH,
@@ -44,13 +44,17 @@ from drake_teleop.station.passivity.packet import (
 
 # Parameters; pairs are for translation and rotation.
 _layout = own_parameters()
-_SEND_RATE, _DRAIN_RATE = _layout.number(), _layout.number()
-_INITIAL_ENERGY, _FILL_LEVEL, _CAPACITY = _layout.vector(2), _layout.vector(2), _layout.vector(2)
-_FILL_DAMPING, MAX_ACCELERATION = _layout.vector(2), _layout.vector(2)
+_SEND_RATE, _MAX_TANK_DRAIN_RATE = _layout.number(), _layout.number()
+_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (
+    _layout.vector(2),
+    _layout.vector(2),
+    _layout.vector(2),
+)
+_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
 _TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _layout = own_memory()
-_SPRING_WRENCH, _DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
+_SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
 
 
 @settings
@@ -81,20 +85,24 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_SEND_RATE], p[_DRAIN_RATE] = self.send_rate, self.drain_rate
-        p[_INITIAL_ENERGY], p[_FILL_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
-        p[_FILL_DAMPING], p[MAX_ACCELERATION] = self.damper, self.acceleration
+        p[_SEND_RATE], p[_MAX_TANK_DRAIN_RATE] = self.send_rate, self.drain_rate
+        p[_INITIAL_TANK_ENERGY], p[_TARGET_TANK_LEVEL], p[_TANK_CAPACITY] = (
+            self.initial,
+            self.level,
+            self.capacity,
+        )
+        p[_DAMPING_PER_MISSING_ENERGY], p[MAX_PORT_ACCELERATION] = self.damper, self.acceleration
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[STORED_ENERGY] = p[_INITIAL_ENERGY]
+    memory[STORED_ENERGY] = p[_INITIAL_TANK_ENERGY]
 
 
 @njit(cache=True)
-def _exchange_energy(received, dx, T, p, memory, packet):
+def _exchange_tank_energy(received, dx, T, p, memory, packet):
     ledger, sent_so_far = memory[STORED_ENERGY], memory[SENT_ENERGY]
-    held, capacity = memory[LAST_WRENCH], p[_CAPACITY]
+    held, capacity = memory[LAST_WRENCH], p[_TANK_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += credit_new_energy(g, received, memory)
@@ -104,43 +112,43 @@ def _exchange_energy(received, dx, T, p, memory, packet):
         sent_so_far[g] += sent
         memory[DISSIPATED_ENERGY][g] += lost
         ledger[g] = level - lost
-        packet[ENERGY][g] = sent_so_far[g]
+        packet[CUMULATIVE_ENERGY][g] = sent_so_far[g]
 
 
 @njit(cache=True)
-def _max_energy_use(f, dx, g, acceleration, T):
+def _max_step_work(f, dx, g, acceleration, T):
     return dot_of_group(f, dx, g) + length_of_group(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
-def _limit_to_tank(f, dx, g, acceleration, T, memory):
-    cost, level = _max_energy_use(f, dx, g, acceleration, T), max(memory[STORED_ENERGY][g], 0.0)
+def _limit_wrench_to_tank(f, dx, g, acceleration, T, memory):
+    cost, level = _max_step_work(f, dx, g, acceleration, T), max(memory[STORED_ENERGY][g], 0.0)
     if cost > level:
         scale_group(f, g, level / cost)
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    _exchange_energy(received, dx, T, p, memory, packet)
+    _exchange_tank_energy(received, dx, T, p, memory, packet)
     ledger, requested = memory[STORED_ENERGY], received[WRENCH]
     for g in range(2):
-        damping = p[_FILL_DAMPING][g] * max(p[_FILL_LEVEL][g] - ledger[g], 0.0)
+        damping = p[_DAMPING_PER_MISSING_ENERGY][g] * max(p[_TARGET_TANK_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
         limit_group(wrench, g, limits[g])
         drained = dot_of_group(wrench, dx, g)
-        drainable = min(T * p[_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
+        drainable = min(T * p[_MAX_TANK_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if drained > drainable:
             scale_group(wrench, g, drainable / drained)
-        _limit_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
+        _limit_wrench_to_tank(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    spring, brake = memory[_SPRING_WRENCH], memory[_DAMPER_WRENCH]
-    _exchange_energy(received, dx, T, p, memory, packet)
+    spring, brake = memory[_SERVO_SPRING_WRENCH], memory[_SERVO_DAMPER_WRENCH]
+    _exchange_tank_energy(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
     if has_arrived(received):
         target = received[POSE]
@@ -153,18 +161,18 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             motor_wrench[i] = spring[i] + brake[i]
         mass = p[SLAVE_MASS][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_CAPACITY][g], 0.0)
-        acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
-        if _max_energy_use(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(brake, g) / mass
-            available -= _max_energy_use(brake, dx, g, acceleration, T)
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(spring, g) / mass
-            cost = _max_energy_use(spring, dx, g, acceleration, T)
+        available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_TANK_CAPACITY][g], 0.0)
+        acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+        if _max_step_work(motor_wrench, dx, g, acceleration, T) > available:
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(brake, g) / mass
+            available -= _max_step_work(brake, dx, g, acceleration, T)
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(spring, g) / mass
+            cost = _max_step_work(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
-            _limit_to_tank(motor_wrench, dx, g, acceleration, T, memory)
+            acceleration = p[MAX_PORT_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
+            _limit_wrench_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
     move_pose_into(pose, spring, memory[COMMAND_POSE])
@@ -175,7 +183,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held, K, D = memory[_SPRING_WRENCH], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
+    spring, held, K, D = memory[_SERVO_SPRING_WRENCH], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

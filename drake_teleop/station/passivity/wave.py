@@ -15,7 +15,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
-    CHANNEL_FILL_TIME,
+    CHANNEL_FILL_TIME_LEFT,
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
@@ -29,9 +29,9 @@ from drake_teleop.station.passivity.memory import (
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     INTEGRAL,
-    MAX_WRENCH_RATE,
+    MAX_HAND_WRENCH_RATE,
     PACKET_NUMBER,
     POSE,
     credit_new_energy,
@@ -46,14 +46,14 @@ from drake_teleop.station.passivity.packet import (
 # Parameters.
 _layout = own_parameters()
 WAVE_IMPEDANCE = _layout.vector(2)
-_FILTER_TIME, _MATCHING_DAMPER_SHARE = _layout.number(), _layout.number()
-_MAX_SILENCE, _DRIFT_RATE = _layout.number(), _layout.number()
+_WAVE_FILTER_TIME, _MATCHING_DAMPER_SHARE = _layout.number(), _layout.number()
+_MAX_SILENCE_BEFORE_HOLD, _POSE_DRIFT_CORRECTION_RATE = _layout.number(), _layout.number()
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
 _layout = own_memory()
-_OUTPUT_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _OUTPUT_WAVE = (_layout.vector(6) for _ in range(3))
+_FILTERED_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _FILTERED_WAVE = (_layout.vector(6) for _ in range(3))
 _SILENCE_TIME, _POSE_DRIFT = _layout.number(), _layout.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
-_IS_CATCHING_UP, _NEWEST_PACKET = _layout.number(), _layout.number()
+_IS_WRENCH_CATCHING_UP, _NEWEST_PACKET_NUMBER = _layout.number(), _layout.number()
 
 
 @settings
@@ -86,21 +86,21 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[WAVE_IMPEDANCE], p[_FILTER_TIME] = self.impedance, self.filter
-        p[_MATCHING_DAMPER_SHARE], p[_MAX_SILENCE] = self.matching, self.patience
-        p[_DRIFT_RATE] = self.drift_rate
+        p[WAVE_IMPEDANCE], p[_WAVE_FILTER_TIME] = self.impedance, self.filter
+        p[_MATCHING_DAMPER_SHARE], p[_MAX_SILENCE_BEFORE_HOLD] = self.matching, self.patience
+        p[_POSE_DRIFT_CORRECTION_RATE] = self.drift_rate
 
 
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory, wave):
-    ledger, played = memory[STORED_ENERGY], memory[_OUTPUT_WAVE_INTEGRAL]
+    ledger, played = memory[STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
         ledger[g] += credit_new_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
         left, store = dot_of_group(wave, wave, g), 2.0 * T * ledger[g]
-        share = T / (T + p[_FILTER_TIME])
+        share = T / (T + p[_WAVE_FILTER_TIME])
         if share * left > (2.0 - share) * store:
             share = 2.0 * store / (left + store)
         for i in range(3 * g, 3 * g + 3):
@@ -111,12 +111,12 @@ def _filter_received_wave(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    wave, integral, sent = memory[_OUTPUT_WAVE], memory[_SENT_WAVE_INTEGRAL], packet[INTEGRAL]
+    wave, integral, sent = memory[_FILTERED_WAVE], memory[_SENT_WAVE_INTEGRAL], packet[INTEGRAL]
     _filter_received_wave(received, T, p, memory, wave)
-    catching_up, newest = memory[_IS_CATCHING_UP], received[PACKET_NUMBER]
-    if newest > memory[_NEWEST_PACKET] + 1.0:
+    catching_up, newest = memory[_IS_WRENCH_CATCHING_UP], received[PACKET_NUMBER]
+    if newest > memory[_NEWEST_PACKET_NUMBER] + 1.0:
         catching_up = 1.0
-    memory[_IS_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
+    memory[_IS_WRENCH_CATCHING_UP], memory[_NEWEST_PACKET_NUMBER] = 0.0 if fresh else 1.0, newest
     for g in range(2):
         b = p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
@@ -127,14 +127,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
-            most = MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
+            most = MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
             if _limit_wrench_change(g, energy, dx, most, memory[LAST_WRENCH], wrench):
-                memory[_IS_CATCHING_UP] = 1.0
+                memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[SENT_ENERGY][g] += max(left, 0.0)
-        packet[ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
@@ -159,11 +159,11 @@ def _limit_wrench_change(g, energy, dx, most, held, wrench):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
-    if memory[CHANNEL_FILL_TIME] > 0.0:
-        memory[CHANNEL_FILL_TIME] -= T
+    if memory[CHANNEL_FILL_TIME_LEFT] > 0.0:
+        memory[CHANNEL_FILL_TIME_LEFT] -= T
         step[:] = 0.0
         _reflect_wave_while_channel_fills(received, wrench, T, p, memory)
-    elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE]:
+    elif memory[_SILENCE_TIME] <= p[_MAX_SILENCE_BEFORE_HOLD]:
         _reflect_wave(received, wrench, T, p, memory)
         if has_arrived(received):
             _correct_pose_drift(received, wrench, T, p, memory)
@@ -174,7 +174,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         step[:] = 0.0
         _reflect_wave_at_held_command(wrench, T, p, memory)
     copy_into(packet, INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
-    copy_into(packet, ENERGY.start, memory, SENT_ENERGY.start, 2)
+    copy_into(packet, CUMULATIVE_ENERGY.start, memory, SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
@@ -182,7 +182,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _reflect_wave(received, wrench, T, p, memory):
-    wave, step, integral = memory[_OUTPUT_WAVE], memory[COMMAND_TWIST], memory[_SENT_WAVE_INTEGRAL]
+    wave, step, integral = (
+        memory[_FILTERED_WAVE],
+        memory[COMMAND_TWIST],
+        memory[_SENT_WAVE_INTEGRAL],
+    )
     _filter_received_wave(received, T, p, memory, wave)
     for g in range(2):
         b, damper = p[WAVE_IMPEDANCE][g], p[_MATCHING_DAMPER_SHARE] * p[WAVE_IMPEDANCE][g]
@@ -197,8 +201,8 @@ def _reflect_wave(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _reflect_wave_at_held_command(wrench, T, p, memory):
-    wave, ledger = memory[_OUTPUT_WAVE], memory[STORED_ENERGY]
-    played, integral = memory[_OUTPUT_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
+    wave, ledger = memory[_FILTERED_WAVE], memory[STORED_ENERGY]
+    played, integral = memory[_FILTERED_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
@@ -213,16 +217,16 @@ def _reflect_wave_at_held_command(wrench, T, p, memory):
 
 @njit(cache=True)
 def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
-    wave, ledger, accounted = memory[_OUTPUT_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
-    played, integral = memory[_OUTPUT_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
+    wave, ledger, accounted = memory[_FILTERED_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
+    played, integral = memory[_FILTERED_WAVE_INTEGRAL], memory[_SENT_WAVE_INTEGRAL]
     for g in range(2):
-        accounted[g] = max(accounted[g], received[ENERGY][g])
+        accounted[g] = max(accounted[g], received[CUMULATIVE_ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
-            played[i] = received[INTEGRAL][i] - p[_FILTER_TIME] * wave[i]
+            played[i] = received[INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
         memory[SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
-        ledger[g] = 0.5 * (T + p[_FILTER_TIME]) * dot_of_group(wave, wave, g)
+        ledger[g] = 0.5 * (T + p[_WAVE_FILTER_TIME]) * dot_of_group(wave, wave, g)
 
 
 @njit(cache=True)
@@ -232,4 +236,4 @@ def _correct_pose_drift(received, wrench, T, p, memory):
     for g in range(2):
         if dot_of_group(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):
-                step[i] += min(T * p[_DRIFT_RATE], 1.0) * drift[i]
+                step[i] += min(T * p[_POSE_DRIFT_CORRECTION_RATE], 1.0) * drift[i]

@@ -53,7 +53,7 @@ from drake_teleop.station.slave.arm import (
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
-_RMS_LEVER_M_PER_RAD = 0.4
+_SENSOR_RMS_LEVER_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
@@ -64,18 +64,18 @@ _ACCELEROMETER_POSITION = 6  # (3,)
 _ACCELEROMETER_AXES = _ACCELEROMETER_POSITION + 3  # (3, 3)
 _ANGLE_LOW_PASSES = _ACCELEROMETER_AXES + 9  # (4, 5) the sensor's and those of `encoders`
 _NUM_ANGLE_SECTIONS = 4
-_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_ANGLE_SECTIONS
-_LINEAR_GAINS = _ANGULAR_GAINS + 3
+_ANGLE_FUSION_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_ANGLE_SECTIONS
+_LINEAR_FUSION_GAINS = _ANGLE_FUSION_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
 _FLAGGED_SAMPLES_LEFT = 1
-_ANGULAR_FILTER_START = 2
+_ANGULAR_FUSION_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
-_LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FUSION_FILTER_SIZE
-_KINEMATICS_SCRATCH_START = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
-_JOINT_START = _KINEMATICS_SCRATCH_START + SENSOR_MOTION_SIZE
-_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
+_LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
+_KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
+_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + SENSOR_MOTION_SIZE
+_MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 
 
 @settings
@@ -160,7 +160,7 @@ def fusion_gains(
     return (
         steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_gains(
-            angle_std * _RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
+            angle_std * _SENSOR_RMS_LEVER_M_PER_RAD, s_std.mean(), config.acceleration_drift, period
         ),
     )
 
@@ -182,7 +182,7 @@ def estimated_motion_std(
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _encoder_angle_std(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
+    return np.repeat([alpha * _SENSOR_RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
 
 
 def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
@@ -229,7 +229,7 @@ def initialize_motion_estimator(
     )
     rows = int(np.ceil(waits.max())) + 1
     return constants, np.zeros(
-        _JOINT_START + _NUM_VALUES_PER_JOINT * num_joints + rows * (12 + num_joints)
+        _JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * num_joints + rows * (12 + num_joints)
     )
 
 
@@ -267,8 +267,8 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
-    joints = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
+    joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
     angles = sample[SAMPLE_JOINT_POSITION]
     _align_signal_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
@@ -290,7 +290,7 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_START]
+    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     _align_signal_paths(constants, memory, n, reading, sample)
     copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
@@ -299,14 +299,17 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
 
 @njit(cache=True)
 def _align_signal_paths(constants, memory, n, reading, sample):
-    sections, angles = constants[_ANGLE_LOW_PASSES:_ANGULAR_GAINS], sample[SAMPLE_JOINT_POSITION]
-    filtered = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n][5 * n :]
+    sections, angles = (
+        constants[_ANGLE_LOW_PASSES:_ANGLE_FUSION_GAINS],
+        sample[SAMPLE_JOINT_POSITION],
+    )
+    filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
     width = 12 + n
-    line = memory[_JOINT_START + _NUM_VALUES_PER_JOINT * n :]
+    line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
     for i in range(12):
@@ -357,8 +360,8 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
     for i in range(3):
         omega[i] = motion[3 + i]
 
-    angular = memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START]
-    linear = memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH_START]
+    angular = memory[_ANGULAR_FUSION_FILTER_START:_LINEAR_FUSION_FILTER_START]
+    linear = memory[_LINEAR_FUSION_FILTER_START:_KINEMATICS_SCRATCH_START]
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)
@@ -367,7 +370,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
-        _update_fusion_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
+        _update_fusion_filters(constants[_ANGLE_FUSION_GAINS:], period, motion, alpha, angular)
         for i in range(3):
             angular[12 + i] -= motion[i]
             alpha[i] += motion[i]
@@ -386,7 +389,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # reuses the encoders' omega
         a_W[0], a_W[1], a_W[2] = plus(apply_matrix(R, s), gravity)
-        _update_fusion_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
+        _update_fusion_filters(constants[_LINEAR_FUSION_GAINS:], period, motion, a_W, linear)
         correction = apply_matrix(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]

@@ -59,7 +59,7 @@ from drake_teleop.station.sensor.motion_estimation import (
     initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
-    LOST_FLAG_SAMPLES,
+    LOST_READING_FLAG_SAMPLES,
     NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
@@ -73,13 +73,18 @@ Array = NDArray[np.float64]
 
 _NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
-_DEFAULT_PERIOD_S = 1e-3
+_DEFAULT_SAMPLING_PERIOD_S = 1e-3
 #: Tolerance of whole multiples of the plant's time step, in steps.
 _STEP_RATIO_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
-_SENSOR_POSITION, _SENSOR_ORIENTATION = 0, 3
-_WELD_ORIENTATION, _WELD_POSITION, _GRAVITY, _WRENCH_SIGN = 12, 21, 24, 27
+_SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
+_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR, _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = (
+    12,
+    21,
+    24,
+    27,
+)
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
 
@@ -269,19 +274,19 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
     alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
-    r = apply_matrix(R_WB, vector_at(geometry, _SENSOR_POSITION))
+    r = apply_matrix(R_WB, vector_at(geometry, _SENSOR_POSITION_IN_BODY))
     a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
-    R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION)), transposed(R_WB)
-    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY))))
+    R_SB, R_BW = transposed(matrix_at(geometry, _SENSOR_ORIENTATION_IN_BODY)), transposed(R_WB)
+    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY_IN_WORLD))))
     omega = apply_matrix(R_SB, apply_matrix(R_BW, omega))
     alpha = apply_matrix(R_SB, apply_matrix(R_BW, alpha))
-    R_SJc = matrix_at(geometry, _WELD_ORIENTATION)
+    R_SJc = matrix_at(geometry, _WELD_ORIENTATION_IN_SENSOR)
     f = apply_matrix(R_SJc, vector_at(reaction, 3))
     tau = apply_matrix(R_SJc, vector_at(reaction, 0))
-    tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION), f))
+    tau = plus(tau, cross(vector_at(geometry, _WELD_POSITION_IN_SENSOR), f))
     for i in range(3):
-        truth[SAMPLE_WRENCH.start + i] = geometry[_WRENCH_SIGN] * f[i]
-        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_WRENCH_SIGN] * tau[i]
+        truth[SAMPLE_WRENCH.start + i] = geometry[_REACTION_WRENCH_SIGN] * f[i]
+        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_REACTION_WRENCH_SIGN] * tau[i]
         truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
         truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
         truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
@@ -294,7 +299,7 @@ def _measure_sample_into(sensor, truth, noise, memory, sample):
     constants, motion_constants, end, ideal = sensor
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
@@ -335,7 +340,7 @@ def _event_period_and_ratio(step: float | None, period: float | None) -> tuple[f
             remedy="give the time between samples [s]",
         )
     if step is None:
-        return period or _DEFAULT_PERIOD_S, 1
+        return period or _DEFAULT_SAMPLING_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
         raise DrakeTeleopError(

@@ -45,7 +45,7 @@ _NUM_CHANNELS = 12
 NOISE_BLOCK_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
-LOST_FLAG_SAMPLES = 40
+LOST_READING_FLAG_SAMPLES = 40
 
 #: Keys of `drake_teleop.station.sensor.presets.PRESETS`.
 PRESET_NAMES = (
@@ -56,9 +56,9 @@ _LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
 # Overload limit in ranges.
-_OVERLOAD_FACTOR = 10.0
+_PLAUSIBLE_RANGES_UNSATURATED = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
-_OVERSHOOT_FACTOR = 1.5
+_PLAUSIBLE_RANGES_SATURATED = 1.5
 
 
 @settings
@@ -168,7 +168,11 @@ class WristSensorConfig:
 
     def largest_plausible_wrench(self) -> NDArray[np.float64]:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
-        share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
+        share = (
+            _PLAUSIBLE_RANGES_SATURATED
+            if self.saturates and not self.ideal
+            else _PLAUSIBLE_RANGES_UNSATURATED
+        )
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
@@ -300,7 +304,9 @@ TRUE_JOINT_ANGLES = slice(15, None)
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 # Constants: 12 offsets, 12 drifts per sample, then these.
-_DRIFT, _NOISE, _WALK, _QUANTUM_START, _RANGE_START = range(12, 72, 12)
+_DRIFT_PER_SAMPLE_START, _NOISE_STD_START, _WALK_STEP_STD_START, _RESOLUTION_START, _RANGE_START = (
+    range(12, 72, 12)
+)
 _WRENCH_CALIBRATION = 72  # (6, 6)
 _MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s and alpha
 _ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
@@ -354,7 +360,7 @@ def initialize_sensor_chain(
                 config.encoder_resolution,
                 config.ideal,
             ],
-            _OVERLOAD_FACTOR * config.ranges()[:6],
+            _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
@@ -403,7 +409,10 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         for i in range(_NUM_CHANNELS):
-            walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
+            walks[i] += (
+                constants[_WALK_STEP_STD_START + i]
+                * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
+            )
 
     _apply_calibration_errors(constants, truth, channels)
     if place == _LOW_PASS_BEFORE_NOISE:
@@ -411,12 +420,12 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[i] + count * constants[_DRIFT + i]
+        channels[i] += constants[i] + count * constants[_DRIFT_PER_SAMPLE_START + i]
     if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
+        channels[i] += constants[_NOISE_STD_START + i] * noise[first + i] + walks[i]
     row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
@@ -471,7 +480,7 @@ def _apply_calibration_errors(constants, truth, out):
 def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum = constants[_QUANTUM_START + i]
+        quantum = constants[_RESOLUTION_START + i]
         limit = constants[_RANGE_START + i]
         value = channels[i]
         if quantum > 0.0:

@@ -59,7 +59,7 @@ from drake_teleop.station.sensor.motion_estimation import (
 )
 from drake_teleop.station.sensor.sensor_chain import (
     FILTER_MEMORY_START,
-    LOST_FLAG_SAMPLES,
+    LOST_READING_FLAG_SAMPLES,
     NOISE_BLOCK_SIZE,
     OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
@@ -91,12 +91,12 @@ from drake_teleop.station.slave.plant_dynamics import (
 Array = NDArray[np.float64]
 
 #: Tolerance of equal instants, in periods.
-_TIME_TOLERANCE_PERIODS = 1e-6
+_EQUAL_TIME_TOLERANCE_PERIODS = 1e-6
 #: Largest number of queued steps.
-_MAX_QUEUED_STEPS = 16
+_MAX_QUEUED_PLANT_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
-_ACCELERATION_CHECK_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
+_ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
 #: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
 _USE_COMPILED_CONTACT = np.zeros(0)
 
@@ -153,7 +153,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
     if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
         return
     lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
@@ -247,7 +247,7 @@ def take_due_samples(
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
-        if (count + _TIME_TOLERANCE_PERIODS) * period >= until:
+        if (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period >= until:
             continue
         _extrapolate_torque_into(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
@@ -255,7 +255,7 @@ def take_due_samples(
             _extrapolate_torque_into(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
-        while (count + _TIME_TOLERANCE_PERIODS) * period < until:
+        while (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period < until:
             u = (count * period - start[0]) / h
             _interpolate_state(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
@@ -266,10 +266,10 @@ def take_due_samples(
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
-    taken = (count - 1.0 + _TIME_TOLERANCE_PERIODS) * period > time
+    taken = (count - 1.0 + _EQUAL_TIME_TOLERANCE_PERIODS) * period > time
     copy_into(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _TIME_TOLERANCE_PERIODS) * period < time:
+    if until_now and (count - _EQUAL_TIME_TOLERANCE_PERIODS) * period < time:
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
@@ -332,7 +332,7 @@ class WristSensor(LeafSystem):
         self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
         self._max_queued_steps = (
-            _MAX_QUEUED_STEPS if slave.can_touch and not contact.drake_contact_reason else 1
+            _MAX_QUEUED_PLANT_STEPS if slave.can_touch and not contact.drake_contact_reason else 1
         )
         self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
@@ -385,7 +385,9 @@ class WristSensor(LeafSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
-        self.DeclarePeriodicPublishEvent(_ACCELERATION_CHECK_S, 0.0, self._check_acceleration)
+        self.DeclarePeriodicPublishEvent(
+            _ACCELERATION_CHECK_PERIOD_S, 0.0, self._check_acceleration
+        )
 
     @property
     def motion_dependent_indices(self) -> NDArray[np.intp]:
@@ -407,7 +409,7 @@ class WristSensor(LeafSystem):
         """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
-        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE_PERIODS), 0.0
+        tail[0], tail[1] = np.ceil(time / self._period - _EQUAL_TIME_TOLERANCE_PERIODS), 0.0
         append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
     def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
@@ -502,7 +504,7 @@ class WristSensor(LeafSystem):
 
     def _are_samples_due(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
-        margin, (held, block) = _TIME_TOLERANCE_PERIODS * self._period, self._event_periods
+        margin, (held, block) = _EQUAL_TIME_TOLERANCE_PERIODS * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
@@ -523,7 +525,7 @@ class WristSensor(LeafSystem):
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
         error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
-        if not error < _ACCELERATION_TOLERANCE * (1.0 + size):
+        if not error < _ACCELERATION_CHECK_TOLERANCE * (1.0 + size):
             raise DrakeTeleopError(
                 f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
                 "not receive it",
