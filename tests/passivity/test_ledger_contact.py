@@ -49,7 +49,7 @@ from drake_teleop.station.passivity.methods import (
     step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
-    ENERGY,
+    CUMULATIVE_ENERGY,
     MAX_HAND_WRENCH_RATE,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
@@ -426,7 +426,7 @@ def test_slave_counts_energy_in_transit_to_the_hand(stale_level):
 def test_level_in_the_packet_of_the_hand_excludes_received_energy(received):
     """The slave adds all that it has sent."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[ENERGY] = received
+    hand.packet[CUMULATIVE_ENERGY] = received
     hand.rest(1500)
     levels = hand.sent[PACKET_LEDGER_LEVEL] + hand.memory[RECEIVED_ENERGY]
     np.testing.assert_allclose(levels, hand.memory[STORED_ENERGY])
