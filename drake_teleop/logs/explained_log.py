@@ -20,7 +20,7 @@ from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
+from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
@@ -268,9 +268,9 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 def _acceleration_noise(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BLOCK_MEAN_BANDWIDTH_HZ, 500)
-    share = passed_noise_share(f, splines.spacing)
+    share = noise_share_passed_by_splines(f, splines.spacing)
     if splines.imu_rows is not None:
-        share = share * splines.imu_rows.remaining_noise_shares(f)[0]
+        share = share * splines.imu_rows.pose_noise_shares_left_by_imu(f)[0]
     power = (
         2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
     )

@@ -66,7 +66,7 @@ def fit_load_to_posed_log(
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
-        if not found.is_imu_consistent or (finding is not None and not rotated):
+        if not found.is_imu_consistent_with_poses or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
@@ -144,6 +144,6 @@ def _note_on_estimate(found: PoseEstimate, stated: float) -> str:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(
             f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.deviation_inflation:.2g} times as large as by noise"
+            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
         )
     return "; ".join(notes)

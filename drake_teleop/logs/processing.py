@@ -87,7 +87,7 @@ class IdentifiedLog:
         findings: suspected errors of the log description.
         causes: effects beside a rigid load with constant offsets that the fit includes.
         loads: load of each part of the record, if it changes.
-        delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
+        delay_std_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
 
     log: Log
@@ -99,7 +99,7 @@ class IdentifiedLog:
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
     loads: tuple[RecordPartWithLoad, ...] = ()
-    delay_deviation_s: float = float("nan")
+    delay_std_s: float = float("nan")
 
     def __repr__(self) -> str:
         return repr(self.identification)
@@ -267,7 +267,7 @@ def _read_and_identify_log(
         findings,
         causes,
         loads,
-        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation_s,
+        delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
 
@@ -290,7 +290,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
         return checks
     findings, delay = checks.findings, checks.delay_s
-    deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
+    deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
