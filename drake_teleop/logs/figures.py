@@ -69,8 +69,8 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
         "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
-        "identifiable": _names_of_parameters(load, True),
-        "not_identifiable": _names_of_parameters(load, False),
+        "identifiable": _names_by_identifiability(load, True),
+        "not_identifiable": _names_by_identifiability(load, False),
         "physically_consistent": load.physically_consistent,
     }
 
@@ -101,7 +101,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _names_of_parameters(result: Identification, identifiable: bool) -> list[str]:
+def _names_by_identifiability(result: Identification, identifiable: bool) -> list[str]:
     pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
@@ -161,7 +161,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
     return figures
 
 
-def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
     wrenches = {
         "raw": found.measured - found.measured[0],
