@@ -12,9 +12,9 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import (
     PARAMETER_NAMES,
-    SIGNIFICANT_DEVIATIONS,
+    SIGNIFICANT_STDS_BELOW_ZERO,
     Identification,
-    com_deviations,
+    com_standard_deviations,
     consistency_margin,
 )
 from drake_teleop.load.inertia import mass_com_inertia
@@ -50,7 +50,7 @@ def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
         "mass": mass,
         "mass_std": deviations[0],
         "com": com,
-        "com_std": com_deviations(stretch.phi, stretch.covariance),
+        "com_std": com_standard_deviations(stretch.phi, stretch.covariance),
         "phi": stretch.phi,
         "phi_std": deviations,
     }
@@ -63,7 +63,7 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "mass": load.mass,
         "mass_std": deviations[6],
         "com": load.com,
-        "com_std": com_deviations(load.phi, load.covariance),
+        "com_std": com_standard_deviations(load.phi, load.covariance),
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
@@ -85,7 +85,7 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
 
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < SIGNIFICANT_DEVIATIONS * deviation:
+    if alone.mass < SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         return [
             f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
             f" ± {deviation:.2g} kg"
@@ -93,7 +93,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
-    if margin < -SIGNIFICANT_DEVIATIONS * deviation:
+    if margin < -SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"

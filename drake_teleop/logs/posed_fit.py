@@ -110,7 +110,7 @@ def _batch_result_of_estimate(
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     equations = NormalEquations(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
-    equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
+    equations.add_samples(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()
     unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(covariance))

@@ -317,5 +317,5 @@ def fit_noise_floor(
     # A short record has few long sums: their quantile can be small by chance, their power is not.
     rare /= max(rare[0], 1e-12)
     widths = np.sqrt(np.maximum(np.maximum(power, rare), _MIN_WIDTH**2))
-    floor = replace(floor, correlation=correlation, rho=rho, widths=widths)
-    return replace(floor, reached=statistics_of_log(floor, *rows).max(axis=0))
+    floor = replace(floor, correlation=correlation, rho=rho, sum_widths=widths)
+    return replace(floor, free_maxima=statistics_of_log(floor, *rows).max(axis=0))

@@ -53,7 +53,7 @@ OBJECT_PRIOR_STD = PRIOR_STD[6:]
 # blocks of noise reach the return limit.
 _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
-_FIRST_MOMENT_BOUND_FACTOR, _MIN_SIZE_M = 10.0, 0.03
+_FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
 _MAX_NEGATIVE_DEVIATIONS = 4.0
 
@@ -180,7 +180,7 @@ def _is_identified(memory, bound):
     P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
-    moment = bound * change * max(size, _MIN_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
+    moment = bound * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
     return math.sqrt(P[6, 6]) <= bound * change and math.sqrt(largest) <= moment
 

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import is_prior_dominated
 from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_DEVIATION,
+    MAX_IDENTIFIED_STD_SHARE,
     Identification,
     is_precise_enough,
 )
@@ -214,7 +214,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_DEVIATION),
+            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_STD_SHARE),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -226,7 +226,7 @@ class RecursiveEstimator(ABC):
     def _are_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return certain & is_precise_enough(
-            deviations * (MAX_IDENTIFIED_DEVIATION / bound), theta[6:]
+            deviations * (MAX_IDENTIFIED_STD_SHARE / bound), theta[6:]
         )
 
     def _condition_number(self) -> float:

@@ -14,7 +14,7 @@ NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so disturbances"
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
-_HUBER_OVER_STD, _REJECTION_OVER_STD, _MAX_ROBUST_FITS = 3.0, 4.5, 30
+_HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
 _STD_PER_NORMAL_MAD = 1.4826
 _MAX_FIT_STD_GROWTH = 2.5
 _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE = 0.3
@@ -43,13 +43,13 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
         distances = _max_residuals_over_std(x, y, weights, inside)
-        weights = inside * np.minimum(1.0, _HUBER_OVER_STD / np.maximum(distances, _HUBER_OVER_STD))
+        weights = inside * np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
     rejected = np.zeros(len(x), bool)
     for _ in range(_MAX_ROBUST_FITS):
         last = rejected
-        rejected = _max_residuals_over_std(x, y, weights, inside) > _REJECTION_OVER_STD
+        rejected = _max_residuals_over_std(x, y, weights, inside) > _REJECTION_STDS
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break

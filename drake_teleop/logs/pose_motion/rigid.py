@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, parameter_errors_by_gains
+from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
 from drake_teleop.logs.pose_motion.spectra import (
@@ -339,7 +339,7 @@ def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain: 
     B, levels = solution.residual_derivative, record.noise_levels
     effects = _parameter_errors_of_unit_gains(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
-    length = np.repeat([1.0, TORQUE_ARM_M], 3)
+    length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, NUM_MOMENT_SIGNALS)  # of channel c by gain d, k
     for c in range(6):
         left[c, c, :, WRENCH_COLUMNS] += np.diag(length[c] / length)
