@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import (
     CONTACT_END_LEVEL,
-    DEFAULT_SLACK,
+    CUSUM_SLACK,
     MEMORY_SIZE,
     ContactDetector,
     central_axis_of_wrenches,
@@ -355,7 +355,7 @@ def test_an_update_is_one_sample():
     memory, floor = np.zeros(MEMORY_SIZE), white(0.5)
     for count in (1.0, 2.0):
         update_statistics(
-            memory, NOISE, *STILL, floor.compiled_parameters, DEFAULT_SLACK, 0.0, CONTACT_END_LEVEL
+            memory, NOISE, *STILL, floor.compiled_parameters, CUSUM_SLACK, 0.0, CONTACT_END_LEVEL
         )
         assert memory[0] == count
 
