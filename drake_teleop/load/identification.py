@@ -31,7 +31,7 @@ MAX_IDENTIFIED_STD_SHARE = 0.05
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
 _MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
 _MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
-_OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
+_OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,7 +166,7 @@ class Identification:
         document = _read_document(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
-        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
+        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FILE_FIELDS - document.keys())):
             problem = "is missing" if name in known else "is not a field of identification.json"
             raise DrakeTeleopError(problem, where=f"{path}:{name}")
 

@@ -18,7 +18,7 @@ from drake_teleop.load.contact.detection import (
     statistics_of_log,
 )
 from drake_teleop.load.contact.noise_floor import (
-    THRESHOLD_MARGIN,
+    THRESHOLD_OVER_MAX,
     DetectorSamples,
     NoiseFloor,
     statistic_index,
@@ -50,20 +50,20 @@ class Detection:
     """Contact in a log of N samples.
 
     Attributes:
-        floor: noise floor of the free motion.
+        noise_floor: that of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
         statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
-        free_s: duration of the free motion that determined the floor [s].
+        free_duration_s: duration of the free motion that determined the floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
     """
 
-    floor: NoiseFloor
+    noise_floor: NoiseFloor
     statistic: str
     threshold: float
     statistics: Array
     touched: NDArray[np.bool_]
-    free_s: float
+    free_duration_s: float
     force_threshold: float
     notes: tuple[str, ...] = ()
 
@@ -120,13 +120,13 @@ def detect_contact(
     if free is None:
         _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
     return Detection(
-        floor=floor,
+        noise_floor=floor,
         statistic=statistic,
         threshold=threshold,
         statistics=values,
         touched=touched,
-        free_s=len(train.contact) * (dt if free is None else free[1]),
-        force_threshold=THRESHOLD_MARGIN
+        free_duration_s=len(train.contact) * (dt if free is None else free[1]),
+        force_threshold=THRESHOLD_OVER_MAX
         * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
         notes=() if free is not None else _detection_notes(floor, touched, usual),
     )
@@ -170,7 +170,7 @@ def _fit_floor_to_log(
             reached = min(reached, float(values.max()))
         reached = max(_MIN_STATISTIC_MAXIMUM, reached)
         detector = ContactDetector(
-            floor, THRESHOLD_MARGIN * reached, statistic=statistic, hold=hold
+            floor, THRESHOLD_OVER_MAX * reached, statistic=statistic, hold=hold
         )
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
         if (
@@ -209,7 +209,7 @@ def _remove_marginal_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):
-        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_MARGIN * threshold:
+        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_OVER_MAX * threshold:
             touched[start:stop] = False
 
 

@@ -32,7 +32,7 @@ HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
-THRESHOLD_MARGIN = 1.25
+THRESHOLD_OVER_MAX = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
 
@@ -117,7 +117,7 @@ class NoiseFloor:
                 remedy="call fit_noise_floor",
             )
 
-    def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:
+    def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
         return margin * float(
             positive_array("free_maxima", self.free_maxima, 3)[statistic_index(statistic)]
