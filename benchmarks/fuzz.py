@@ -52,7 +52,7 @@ if __name__ == "__main__":  # before libraries look
 from fuzz_targets import TARGETS, Target, target_of
 
 import drake_teleop
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.common.progress import show_progress
 
 _PACKAGE = str(Path(drake_teleop.__file__).parent)
@@ -225,7 +225,7 @@ def _outcome(target: Target, case: Path, errors: int) -> tuple[str, ...]:
         target.run(case)
     except DrakeTeleopError as error:
         line, outcome = str(error), ("refused",)
-        if len(line) > MAX_LINE_LENGTH or len(line.splitlines()) != 1:
+        if len(line) > MAX_ERROR_LINE_LENGTH or len(line.splitlines()) != 1:
             what = f"a message of {len(line)} characters: {line}"
             outcome = "finding", _place(traceback.format_exc()), what
     except BaseException as error:

@@ -29,7 +29,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.cli import main as cli
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.common.files import models_dir, scenarios_dir, studies_dir
 from drake_teleop.common.parquet_sizes import check_parquet_content
 from drake_teleop.common.texts import parse_yaml, read_json
@@ -612,7 +612,7 @@ def _command_line(path: Path) -> None:
     with contextlib.redirect_stderr(said):
         status = cli._run_with_exit_status(words)
     line = said.getvalue().rstrip("\n")
-    refused = line.startswith("error: ") and len(line) <= MAX_LINE_LENGTH and "\n" not in line
+    refused = line.startswith("error: ") and len(line) <= MAX_ERROR_LINE_LENGTH and "\n" not in line
     if refused:
         raise DrakeTeleopError(line.removeprefix("error: "))
     if line or status not in (None, 0, 2):  # 2: the help, for want of words

@@ -326,7 +326,7 @@ def consistent_load() -> dict[str, float]:
     rng = np.random.default_rng(3)
     wrench = non_contact_wrench(s, omega, alpha, rod) + 3 * NOISE * rng.normal(size=(60, 6))
     equations = NormalEquations(NOISE)
-    equations.add(wrench, s, omega, alpha)
+    equations.add_samples(wrench, s, omega, alpha)
     gram, right = (part / 60 for part in equations.normal_equations())
     theta = np.linalg.solve(gram, right)
     if is_physically_consistent(theta[6:]):

@@ -127,7 +127,7 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         A, MRg = np.empty((16, 17)), np.empty((16, 33))
         options = (self._noise_std, 1.0 / self._prior, *nonzero_regressor_terms())
         riv_normal_equations(memory, theta, *options, allocate_scratch(), MRg, A)
-        return self._limit_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
+        return self._limit_variances_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
 
     def update_samples(
         self,

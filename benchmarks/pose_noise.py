@@ -215,9 +215,9 @@ def one(case: Case, motion: str, seed: int, chain: str) -> dict[str, Any]:
         turn = Rotation.from_matrix(found.frame.R_SP).as_rotvec(degrees=True)
         frame = {
             "shift": (1e3 * (found.frame.p_SoPo_S - case.shift)).tolist(),
-            "shift_std": (1e3 * found.frame.position_deviations_m).tolist(),
+            "shift_std": (1e3 * found.frame.position_stds_m).tolist(),
             "turn": turn.tolist(),
-            "turn_std": found.frame.rotation_deviations_deg.tolist(),
+            "turn_std": found.frame.rotation_stds_deg.tolist(),
             "named": found.frame.is_shifted or found.frame.is_rotated,
             "knots": found.splines.spacing,
             "misfit": found.fit.misfit,

@@ -360,7 +360,7 @@ def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     """With a floor so low that the moving load is taken for contacts."""
     rising, still = np.zeros((6, 2)), np.zeros(6)
     floor = NoiseFloor(
-        0.05 * np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+        0.05 * np.ones(6), np.identity(16), rising, np.identity(6), still, free_maxima=np.ones(3)
     )
     scenario = delayed("none", contact_detection=ContactDetectionConfig())
     log = run(scenario, slave, noise_floor=floor).log

@@ -14,7 +14,7 @@ import pytest
 from numba.core.errors import NumbaWarning
 
 from drake_teleop.cli import main as cli
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 
 HEAVY = {"numpy", "scipy", "numba", "polars", "matplotlib", "pydrake", "jinja2", "pydantic", "yaml"}
 
@@ -171,7 +171,7 @@ def test_output_of_a_command_is_kept(capsys, tmp_path):
 
 def test_error_line_has_a_maximum_length(capsys):
     err = run_main(capsys, "run", "\x1b[31m" + "x" * 1000)[2]
-    assert len(err) <= MAX_LINE_LENGTH + len("\n") and err.isascii() and "\x1b" not in err
+    assert len(err) <= MAX_ERROR_LINE_LENGTH + len("\n") and err.isascii() and "\x1b" not in err
 
 
 def test_python_warnings_are_not_printed(capsys, monkeypatch, recwarn):

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 
 pytestmark = pytest.mark.checks
 
@@ -94,7 +94,7 @@ def test_what_was_found_is_one_line(name: str, fuzz: ModuleType, tmp_path: Path,
         except DrakeTeleopError as error:
             line = str(error)
     assert SAID[name] in line and bool(SAID[name]) == bool(line)
-    assert len(line) <= MAX_LINE_LENGTH and len(line.splitlines()) <= 1
+    assert len(line) <= MAX_ERROR_LINE_LENGTH and len(line.splitlines()) <= 1
     assert capfd.readouterr().err == ""
 
 

@@ -36,7 +36,7 @@ SHORT = Simulation(settle=0.0, duration=0.3)
 def floor() -> NoiseFloor:
     rising, still = np.zeros((6, 2)), np.zeros(6)
     return NoiseFloor(
-        np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+        np.ones(6), np.identity(16), rising, np.identity(6), still, free_maxima=np.ones(3)
     )
 
 

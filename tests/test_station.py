@@ -390,7 +390,7 @@ def station_of_all_blocks() -> Diagram:
     scenario = replace(scenario, contact_detection=ContactDetectionConfig())
     rising, still = np.zeros((6, 2)), np.zeros(6)
     floor = NoiseFloor(
-        np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+        np.ones(6), np.identity(16), rising, np.identity(6), still, free_maxima=np.ones(3)
     )
     return MakeTeleopStation(
         scenario,

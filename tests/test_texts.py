@@ -9,7 +9,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError, to_one_line
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError, to_one_line
 from drake_teleop.common.texts import parse_yaml, read_json, read_yaml, to_yaml_text
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.identification import Identification
@@ -53,7 +53,7 @@ def message(read, path, text: str) -> str:
         read(path)
     line = str(caught.value)
     assert line.startswith(str(path))
-    assert len(line) <= MAX_LINE_LENGTH and len(line.splitlines()) == 1
+    assert len(line) <= MAX_ERROR_LINE_LENGTH and len(line.splitlines()) == 1
     return line
 
 
@@ -173,7 +173,7 @@ def identified():
 
 
 def test_huge_file_is_not_read_completely(monkeypatch, tmp_path):
-    monkeypatch.setattr("drake_teleop.common.texts._MAX_VALUES", 100)
+    monkeypatch.setattr("drake_teleop.common.texts._MAX_YAML_VALUES", 100)
     path = tmp_path / "x.yaml"
     expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")
@@ -203,7 +203,7 @@ def test_overlong_integers_raise():
 
 def test_shortened_line_keeps_beginning_and_end():
     line = to_one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
-    assert len(line) == MAX_LINE_LENGTH
+    assert len(line) == MAX_ERROR_LINE_LENGTH
     assert line.startswith("begin x") and line.endswith("x ?[31m end")
 
 

@@ -16,7 +16,7 @@ import polars as pl
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.common.files import (
     CannotWrite,
     make_folder,
@@ -196,7 +196,7 @@ def test_full_disk_at_any_file(tmp_path, monkeypatch, little_work, name):
             except DrakeTeleopError as error:
                 said = str(error)
         assert "cannot be written (No space left on device)" in said
-        assert said.count(str(out)) >= 1 and len(said) <= MAX_LINE_LENGTH
+        assert said.count(str(out)) >= 1 and len(said) <= MAX_ERROR_LINE_LENGTH
         if write == 2:
             assert third in said
         there = {path for path in out.rglob("*") if path.is_file()}

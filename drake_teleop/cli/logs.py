@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
     notes_on_object_alone,
-    share_above_force,
+    shares_of_samples_above_force,
     summarize_detected_contact,
     summarize_load,
     summarize_log,
@@ -198,15 +198,15 @@ def detect_command(
     summary = summarize_log(log, eliminated, cutoff_hz, eliminated.delay_s) | {
         "load": None if load is None else str(load),
         "free": None if free is None else str(free),
-        "free_s": found.free_s,
+        "free_s": found.free_duration_s,
         "statistic": statistic,
         "threshold": found.threshold,
-        "noise": found.floor.noise,
-        "per_acceleration": found.floor.per_acceleration,
+        "noise": found.noise_floor.noise,
+        "per_acceleration": found.noise_floor.per_acceleration,
         "above_threshold": found.is_above_threshold.mean(),
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
-        "above_force_threshold": share_above_force(eliminated, found.force_threshold),
+        "above_force_threshold": shares_of_samples_above_force(eliminated, found.force_threshold),
         "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes

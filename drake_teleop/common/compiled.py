@@ -23,7 +23,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-_PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
+_REPR_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
 
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
@@ -110,19 +110,19 @@ class _CacheFiles:
             temporary.touch(mode=0o644)  # not writable by others, with any umask
             temporary.write_bytes(dumps((key, code)))
             os.replace(temporary, path)
-            self._discard_other_files(keep=self._prefix + fingerprint_of_code(self._dispatcher))
+            self._remove_cache_files(keep=self._prefix + fingerprint_of_code(self._dispatcher))
         except OSError:  # full disk: compile again next time
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
 
     def flush(self) -> None:
-        self._discard_other_files()
+        self._remove_cache_files()
 
     def _path_of_key(self, key: Any) -> Path:
         this = sha256(str(key).encode()).hexdigest()[:16]
         return self._folder / f"{self._prefix}{fingerprint_of_code(self._dispatcher)}-{this}.nbc"
 
-    def _discard_other_files(self, keep: str | None = None) -> None:
+    def _remove_cache_files(self, keep: str | None = None) -> None:
         for path in self._folder.glob(f"{self._prefix}*.nbc"):
             if keep is None or not path.name.startswith(keep):
                 path.unlink(missing_ok=True)
@@ -170,7 +170,7 @@ def _values_referenced_by(function: FunctionType) -> Iterator[tuple[str, Any]]:
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents
-    names = set(_referenced_names(function.__code__))
+    names = set(_names_referenced_by_code(function.__code__))
     package = function.__module__.partition(".")[0]
     scopes = [function.__globals__]
     for scope in scopes:
@@ -183,11 +183,11 @@ def _values_referenced_by(function: FunctionType) -> Iterator[tuple[str, Any]]:
                 scopes.append(vars(value))
 
 
-def _referenced_names(code: CodeType) -> Iterator[str]:
+def _names_referenced_by_code(code: CodeType) -> Iterator[str]:
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _referenced_names(constant)
+            yield from _names_referenced_by_code(constant)
 
 
 def _constant_text(value: Any) -> str:
@@ -202,7 +202,7 @@ def _constant_text(value: Any) -> str:
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
         return _qualified_name(value)
-    if isinstance(value, _PLAIN_TYPES):
+    if isinstance(value, _REPR_TYPES):
         return repr(value)
     raise TypeError(f"a cached compiled function uses {value!r}, whose changes are not detected")
 

@@ -93,7 +93,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
     """Raise DrakeTeleopError, for the place `where`, if the field cannot have this value."""
     check_field_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
-    _check_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
+    _check_field_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
 
 
 def check_ranges(config: Any, where: str) -> None:
@@ -101,13 +101,13 @@ def check_ranges(config: Any, where: str) -> None:
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_place(where, field.name)
-        _check_value(field, kinds[field.name], value, place)
+        _check_field_value(field, kinds[field.name], value, place)
         for index, item in enumerate(value if isinstance(value, list) else [value]):
             if dataclasses.is_dataclass(item):
                 check_ranges(item, f"{place}[{index}]" if isinstance(value, list) else place)
 
 
-def _check_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
+def _check_field_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
     metadata = field.metadata
     _check_type(kind, value, place, from_file=False)
     if "choices" in metadata:
@@ -118,10 +118,10 @@ def _check_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
             remedy = suggest_name(value, words, f"choose one of {', '.join(words)}")
             raise DrakeTeleopError(f"'{value}' is not known", where=place, remedy=remedy)
     elif "unit" in metadata and value is not None:
-        _check_range(metadata, value, place)
+        _check_quantity_range(metadata, value, place)
 
 
-def _check_range(metadata: Any, value: Any, place: str) -> None:
+def _check_quantity_range(metadata: Any, value: Any, place: str) -> None:
     values = value if isinstance(value, list) else [value]
     length = metadata.get("length")
     if length is not None and len(values) != length:
@@ -209,14 +209,14 @@ def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> 
             raise _type_error(TYPE_NAMES[first], value, place, remedy if first is float else "")
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
+        check_structure(_tagged_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"make one: {first.__name__}(...), with fields {fields}"
         raise _type_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
 
 
-def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
+def _tagged_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:

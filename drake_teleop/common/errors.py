@@ -15,7 +15,7 @@ from typing import Any
 
 _POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
 
-MAX_LINE_LENGTH = 1000
+MAX_ERROR_LINE_LENGTH = 1000
 """Maximum length of an error line of the command line."""
 
 
@@ -31,10 +31,10 @@ class DrakeTeleopError(ValueError):
         text = f"{where}: {what}" if where else what
         if remedy:
             text = f"{text}; {remedy}"
-        super().__init__(to_one_line(text, MAX_LINE_LENGTH - len("error: ")))
+        super().__init__(to_one_line(text, MAX_ERROR_LINE_LENGTH - len("error: ")))
 
 
-def to_one_line(text: str, max_length: int = MAX_LINE_LENGTH) -> str:
+def to_one_line(text: str, max_length: int = MAX_ERROR_LINE_LENGTH) -> str:
     """Return the text as one printable line; the middle of a longer text is cut out."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:

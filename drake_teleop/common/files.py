@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 _MAX_LISTED_FILES = 6  # maximum number of listed files
 _RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
-_PART_NAME_FORMAT = "row_{:010d}.parquet"
-LOG_PARTS_PATTERN = _PART_NAME_FORMAT.format(0).replace("0", "?")
+_LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
+LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
 
 
 class CannotWrite(DrakeTeleopError):
@@ -100,13 +100,13 @@ def output_folder(
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
-    before = _file_times_and_sizes(out)
+    before = _file_times_and_inodes(out)
     try:
         yield
     except CannotWrite as error:
-        after = _file_times_and_sizes(out)
+        after = _file_times_and_inodes(out)
         existing = [name for name in after if name in kept or before.get(name) != after[name]]
-        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_names(existing)}") from error
+        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
 
 
 def make_folder(folder: Path) -> None:
@@ -135,7 +135,7 @@ def move_earlier_recordings(*paths: Path) -> Path | None:
 
 
 def log_part_path(folder: Path, first_row: int) -> Path:
-    return folder / _PART_NAME_FORMAT.format(first_row)
+    return folder / _LOG_PART_NAME_FORMAT.format(first_row)
 
 
 def remove_log(path: Path) -> None:
@@ -168,7 +168,7 @@ def _replace_nonfinite_numbers(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def _file_times_and_sizes(folder: Path) -> dict[str, tuple[int, int]]:
+def _file_times_and_inodes(folder: Path) -> dict[str, tuple[int, int]]:
     found = {}
     for path in sorted(folder.iterdir()):
         if not path.is_dir() or any(path.iterdir()):
@@ -177,7 +177,7 @@ def _file_times_and_sizes(folder: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
-def _join_names(names: Sequence[str]) -> str:
+def _join_file_names(names: Sequence[str]) -> str:
     if not names:
         return "nothing"
     more = f" and {len(names) - _MAX_LISTED_FILES} more" if len(names) > _MAX_LISTED_FILES else ""

@@ -13,7 +13,7 @@ INTERRUPTED_EVENT = threading.Event()
 
 
 class _DelayedSignalState(threading.local):
-    depth, received = 0, 0  # open contexts, and the last signal in them
+    open_contexts, last_signal = 0, 0  # delayed_signals contexts, and the last signal in them
 
 
 _DELAYED_SIGNALS = _DelayedSignalState()
@@ -44,8 +44,8 @@ def handle_sigint() -> Iterator[None]:
 
 def _raise_interrupt(number: int, _frame: Any) -> None:
     INTERRUPTED_EVENT.set()
-    if _DELAYED_SIGNALS.depth:
-        _DELAYED_SIGNALS.received = number
+    if _DELAYED_SIGNALS.open_contexts:
+        _DELAYED_SIGNALS.last_signal = number
         return
     if number == signal.SIGTERM:
         raise KeyboardInterrupt("SIGTERM")
@@ -56,10 +56,10 @@ class delayed_signals(ContextDecorator):
     """Context or decorator that delays the KeyboardInterrupt of `install_handlers` to its end."""
 
     def __enter__(self) -> None:
-        _DELAYED_SIGNALS.depth += 1
+        _DELAYED_SIGNALS.open_contexts += 1
 
     def __exit__(self, *_: object) -> None:
-        _DELAYED_SIGNALS.depth -= 1
-        if _DELAYED_SIGNALS.received and not _DELAYED_SIGNALS.depth:
-            number, _DELAYED_SIGNALS.received = _DELAYED_SIGNALS.received, 0
+        _DELAYED_SIGNALS.open_contexts -= 1
+        if _DELAYED_SIGNALS.last_signal and not _DELAYED_SIGNALS.open_contexts:
+            number, _DELAYED_SIGNALS.last_signal = _DELAYED_SIGNALS.last_signal, 0
             _raise_interrupt(number, None)

@@ -9,12 +9,12 @@ from typing import Any
 
 _MAGIC_BYTES = b"PAR1"
 _FOOTER_END_BYTES = 8  # bytes: length of the footer, and magic
-_DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
+_DATA_PAGE_TYPE, _DICTIONARY_PAGE_TYPE, _DATA_PAGE_V2_TYPE = 0, 2, 3
 _REPEATED_FIELD = 2
 # Type codes of Thrift.
 _TRUE, _FALSE, _BYTE_TYPE, _DOUBLE_TYPE, _BINARY_TYPE, _STRUCT_TYPE = 1, 2, 3, 7, 8, 12
 _INTEGER_TYPES, _LIST_TYPES = (4, 5, 6), (9, 10)
-_MAX_NESTING = 32
+_MAX_METADATA_NESTING = 32
 _MAX_VARINT_BYTES = 10
 
 _ThriftStruct = dict[int, Any]
@@ -31,12 +31,12 @@ def check_parquet(path: Path) -> None:
 
 def check_parquet_content(content: bytes | mmap.mmap) -> None:
     try:
-        _check_sizes(content)
+        _check_sizes_in_file(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
         raise ValueError("it is damaged: its metadata cannot be read") from None
 
 
-def _check_sizes(content: bytes | mmap.mmap) -> None:
+def _check_sizes_in_file(content: bytes | mmap.mmap) -> None:
     end = len(content) - _FOOTER_END_BYTES
     if end < len(_MAGIC_BYTES) or content[-len(_MAGIC_BYTES) :] != _MAGIC_BYTES:
         raise ValueError("it does not end with PAR1, as a Parquet file does")
@@ -100,13 +100,13 @@ def _check_column(
 
 def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
     kind, what = page[1], f"values in {where}"
-    if kind == _DATA_PAGE:
+    if kind == _DATA_PAGE_TYPE:
         return _read_size(page[5], 1, what)
-    if kind == _DICTIONARY_PAGE:
+    if kind == _DICTIONARY_PAGE_TYPE:
         _require_undamaged(
             _read_size(page[7], 1, what) <= page[2], f"{where} has fewer bytes than values"
         )
-    if kind != _DATA_PAGE_V2:
+    if kind != _DATA_PAGE_V2_TYPE:
         return 0
     header = page[8]
     values = _read_size(header, 1, what)
@@ -137,7 +137,7 @@ class _ThriftReader:
         self._content, self.at = content, at
 
     def read_struct(self, depth: int = 0) -> _ThriftStruct:
-        _require_undamaged(depth < _MAX_NESTING, "its metadata is nested too deeply")
+        _require_undamaged(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
         fields: _ThriftStruct = {}
         number = 0
         while head := self._read_byte():
@@ -161,7 +161,7 @@ class _ThriftReader:
         return self._read_bytes(8)
 
     def _read_list(self, depth: int) -> list[Any]:
-        _require_undamaged(depth < _MAX_NESTING, "its metadata is nested too deeply")
+        _require_undamaged(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
         head = self._read_byte()
         size = head >> 4 if head >> 4 < 15 else self._read_varint()
         return [self._read_value(head & 15, depth + 1) for _ in range(size)]

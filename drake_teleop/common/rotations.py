@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-NUM_COLUMNS_OF_FORM = {
+NUM_COLUMNS_OF_ROTATION_FORM = {
     "matrix": 9,
     "quaternion_wxyz": 4,
     "quaternion_xyzw": 4,
@@ -28,7 +28,7 @@ EULER_AXES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) from `columns` of a form in `NUM_COLUMNS_OF_FORM`.
+    """Return rotation matrices (N, 3, 3) of `columns`; forms: `NUM_COLUMNS_OF_ROTATION_FORM`.
 
     Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad]. Nothing is
     normalized.

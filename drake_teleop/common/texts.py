@@ -18,8 +18,8 @@ import yaml
 
 from drake_teleop.common.errors import DrakeTeleopError, field_place, to_one_line
 
-_MAX_VALUES = 50_000  # including repetitions by aliases
-_MAX_NESTING = 50  # nested brackets
+_MAX_YAML_VALUES = 50_000  # including repetitions by aliases
+_MAX_BRACKETS = 50  # nested brackets
 _MAX_INTEGER_DIGITS = 18  # digits, always within 64 bits
 
 _TAG_PREFIX = "tag:yaml.org,2002:"
@@ -39,15 +39,15 @@ class _YamlLoader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level >= _MAX_NESTING:  # PyYAML scans thousands before it creates nodes
+        if self.flow_level >= _MAX_BRACKETS:  # PyYAML scans thousands before it creates nodes
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         # Counted here too, to stop reading a huge file early.
         self.nodes = getattr(self, "nodes", 0) + 1
-        if self.nodes > 2 * _MAX_VALUES:  # names are nodes too
-            what = f"there are more than {_MAX_VALUES} values"
+        if self.nodes > 2 * _MAX_YAML_VALUES:  # names are nodes too
+            what = f"there are more than {_MAX_YAML_VALUES} values"
             raise yaml.composer.ComposerError(None, None, what, self.get_mark())
         return super().compose_node(parent, index)
 
@@ -175,8 +175,8 @@ class _NodeConverter:
 
     def convert_node(self, node: Any, place: str) -> Any:
         self._values += 1
-        if self._values > _MAX_VALUES:
-            raise _error_at_node(f"there are more than {_MAX_VALUES} values", node, place)
+        if self._values > _MAX_YAML_VALUES:
+            raise _error_at_node(f"there are more than {_MAX_YAML_VALUES} values", node, place)
         if isinstance(node, yaml.MappingNode):
             return self._convert_mapping(node, place)
         if isinstance(node, yaml.SequenceNode):

@@ -26,12 +26,12 @@ PARAMETER_NAMES = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
-MAX_IDENTIFIED_DEVIATION = 0.05
+MAX_IDENTIFIED_STD_SHARE = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
-_MAX_WEAKLY_IDENTIFIED_DEVIATION, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
+_MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
 _MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
-_OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
+_OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,7 +105,7 @@ class Identification:
         rest = np.where(
             self.prior_dominated,
             "prior",
-            np.where(share <= _MAX_WEAKLY_IDENTIFIED_DEVIATION, "weakly", "not"),
+            np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not"),
         )
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
@@ -122,7 +122,7 @@ class Identification:
                 f"{self.method}, {self.samples} samples: {known}",
                 f"  mass              {_format_numbers([mass], deviations[6:7])} kg",
                 "  centre of mass   "
-                f" {_format_numbers(com, com_deviations(self.phi, self.covariance))} m",
+                f" {_format_numbers(com, com_standard_deviations(self.phi, self.covariance))} m",
                 f"  inertia xx yy zz  {_format_numbers(inertia[[0, 3, 5]])} kg m^2, about that"
                 " centre",
                 f"  inertia xy xz yz  {_format_numbers(inertia[[1, 2, 4]])} kg m^2",
@@ -166,7 +166,7 @@ class Identification:
         document = _read_document(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
-        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
+        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FILE_FIELDS - document.keys())):
             problem = "is missing" if name in known else "is not a field of identification.json"
             raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
@@ -182,7 +182,7 @@ class Identification:
             raise _file_error("is not a text", f"{path}:method")
         readers: dict[str, Callable[[str, Any], Any]] = {
             "weight_removed": _read_flag,
-            "degrees_of_freedom": _read_degrees,
+            "degrees_of_freedom": _read_degrees_of_freedom,
             "prior_dominated": _read_flags,
         }
         optional = {
@@ -237,7 +237,7 @@ def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = 
     return f"{text} +- {deviations.max():.1g}" if np.isfinite(deviations).all() else f"{text} +- ?"
 
 
-def com_deviations(phi: Array, covariance: Array) -> Array:
+def com_standard_deviations(phi: Array, covariance: Array) -> Array:
     """Return standard deviations (3,) of the centre of mass [m]."""
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
@@ -248,13 +248,13 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    return standard_deviations <= MAX_IDENTIFIED_DEVIATION * natural_scales(phi)
+    return standard_deviations <= MAX_IDENTIFIED_STD_SHARE * natural_scales(phi)
 
 
 def natural_scales(phi: Array) -> Array:
     """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
     m = abs(phi[0])
-    L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
+    L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_LOAD_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
     return scale
 
@@ -312,7 +312,7 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
     return np.array(value, dtype=bool)
 
 
-def _read_degrees(where: str, value: Any) -> Array:
+def _read_degrees_of_freedom(where: str, value: Any) -> Array:
     if not (
         isinstance(value, list) and _contains_only_numbers([v for v in value if v is not None])
     ):
@@ -324,7 +324,7 @@ def _read_degrees(where: str, value: Any) -> Array:
     return np.where(unknown, np.inf, degrees)
 
 
-SIGNIFICANT_DEVIATIONS = 3.0
+SIGNIFICANT_STDS_BELOW_ZERO = 3.0
 """Standard deviations below zero at which a mass counts as negative."""
 
 _IS_LOAD_PARAMETER = np.arange(16) >= 6
@@ -339,7 +339,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     covariance[undetermined, :] = covariance[:, undetermined] = 0.0
     covariance[undetermined, undetermined] = np.inf
     deviations = np.sqrt(np.diag(covariance))
-    if phi[0] < -SIGNIFICANT_DEVIATIONS * deviations[6] or phi[0] == 0.0:
+    if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(
             f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)",
             where="gripper",

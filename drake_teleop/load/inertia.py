@@ -13,9 +13,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 
 # Tolerance for rounding, so that rods, plates and points are consistent.
-_ROUNDING_TOLERANCE = 1e-12
+_PSEUDO_INERTIA_ROUNDING_TOLERANCE = 1e-12
 # Squared radius of gyration [m^2] below which a body is a point.
-_MIN_SQUARED_GYRATION_M2 = 1e-290
+_MIN_SQUARED_GYRATION_RADIUS_M2 = 1e-290
 
 
 def _inertia_of_point_mass(about: Array, mass: float) -> Array:
@@ -89,10 +89,10 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     if mass <= 0.0 or spread < 0.0:
         return False
     # Quotients of denormal numbers are inaccurate: treat such a body as a point.
-    length = np.sqrt(spread / mass) if spread > _MIN_SQUARED_GYRATION_M2 * mass else 1.0
+    length = np.sqrt(spread / mass) if spread > _MIN_SQUARED_GYRATION_RADIUS_M2 * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
-    return bool(eigenvalues[0] >= -(tolerance + _ROUNDING_TOLERANCE))
+    return bool(eigenvalues[0] >= -(tolerance + _PSEUDO_INERTIA_ROUNDING_TOLERANCE))
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:

@@ -18,12 +18,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.load.regressor import regressor
 
-_MAX_BLOCKS = 1024
-CHUNK_ROWS = 2**15
+_MAX_MOMENT_BLOCKS = 1024
+SAMPLES_PER_CHUNK = 2**15
 """Samples per pass over a long record."""
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
 # `normal_equations`.
-_MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
+_MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RMS_EXCITATION = 1e-12, 1e-9
 # Indices of the products w_i w_j in z.
 _OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
@@ -72,7 +72,7 @@ class SecondMoments:
     """Sum of z z^T (19, 19) over the samples of a record, z as in the module docstring."""
 
     def __init__(self) -> None:
-        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
+        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_MOMENT_BLOCKS, 19))
         # Index of the open block, samples of a full block, samples of the open block.
         self._state = np.array([0, 1, 0])
 
@@ -90,7 +90,7 @@ class SecondMoments:
             )
         return self._sums / self.num_samples
 
-    def add(
+    def add_samples(
         self,
         wrench: ArrayLike,
         s: ArrayLike,
@@ -104,10 +104,10 @@ class SecondMoments:
         )
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else finite_array("weights", weights, n)
-        for start in range(0, n, CHUNK_ROWS):
+        for start in range(0, n, SAMPLES_PER_CHUNK):
             part = np.zeros((19, 19))
-            chunk = (table[start : start + CHUNK_ROWS] for table in (*rows, weight))
-            _add_products(*chunk, part, self._blocks, self._state)
+            chunk = (table[start : start + SAMPLES_PER_CHUNK] for table in (*rows, weight))
+            _add_sample_products(*chunk, part, self._blocks, self._state)
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: NoiseStd, wrench: Array) -> Array:
@@ -178,19 +178,19 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
     """Return (16,) True for parameters whose influence on the wrench exceeds rounding errors."""
-    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_RMS_EXCITATION**2
 
 
 def root_of_pseudo_inverse(gram: Array, used: NDArray[np.bool_]) -> Array:
     """Return R (n, rank) such that R R^T is the pseudo-inverse of the Gram matrix."""
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+    kept = eigenvalues > _MIN_RELATIVE_GRAM_EIGENVALUE * eigenvalues[-1]
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept]), np.float64)
 
 
 @njit(cache=True)
-def _add_products(wrench, s, omega, alpha, weights, sums, blocks, state):
+def _add_sample_products(wrench, s, omega, alpha, weights, sums, blocks, state):
     z = np.empty(19)
     last, length, filled = state
     for i in range(wrench.shape[0]):

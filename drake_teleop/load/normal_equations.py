@@ -19,15 +19,15 @@ from drake_teleop.load.moments import (
 
 # Smallest relative eigenvalue of the scaled Gram, and largest component of a determined parameter
 # in the null space.
-_MIN_EIGENVALUE, _MAX_NULL_COMPONENT = 1e-12, 1e-6
+_MIN_RELATIVE_GRAM_EIGENVALUE, _MAX_DETERMINED_NULL_COMPONENT = 1e-12, 1e-6
 # Smallest block length over the noise's correlation time, fewest degrees of freedom of a usable
 # variance.
-_MIN_CORRELATION_TIMES, _MIN_DEGREES_OF_FREEDOM = 4.0, 8.0
+_MIN_BLOCK_OVER_CORRELATION, _MIN_DOF_OF_VARIANCE = 4.0, 8.0
 # For noise that is weaker at low frequencies: fewest degrees of freedom, and smallest share of the
 # fit's degrees of freedom that the blocks contain.
-_MIN_DEGREES_OF_LONGEST_BLOCKS, _MIN_ABSORBED_SHARE = 20.0, 0.9
+_MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
-_SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
+_SAME_POSE_WITHIN_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _MAX_ROUNDING_RESIDUAL = 1e-6
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
@@ -130,8 +130,8 @@ class NormalEquations(SecondMoments):
         power = self.residual_squares(theta)
         if self._resolution is not None:
             absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
-            return *self._pose_variances(power, absorbed, theta), np.zeros(6, dtype=bool)
-        variances, degrees = self._unbiased_variances(power, n, grams, grams, inverse)
+            return *self._static_variances(power, absorbed, theta), np.zeros(6, dtype=bool)
+        variances, degrees = self._unbiased_residual_variances(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
         wrench = np.diag(self._sums)[_WRENCH_COLUMNS]
@@ -141,18 +141,18 @@ class NormalEquations(SecondMoments):
         last, length, filled = (int(number) for number in self._state)
         # An unfinished last block would have the weight of a full one.
         blocks = self._blocks[: last + (filled == length)]
-        while len(blocks) > _MIN_DEGREES_OF_FREEDOM:
+        while len(blocks) > _MIN_DOF_OF_VARIANCE:
             rows = _regressors_of_blocks(blocks)
             power = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
-            estimated, counted = self._unbiased_variances(
+            estimated, counted = self._unbiased_residual_variances(
                 power, len(blocks), between, grams, inverse
             )
-            usable = ~found & (counted >= _MIN_DEGREES_OF_FREEDOM)
+            usable = ~found & (counted >= _MIN_DOF_OF_VARIANCE)
             correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
-            at_borders = np.minimum(correlation / (2.0 * length), 0.5 / _MIN_CORRELATION_TIMES)
+            at_borders = np.minimum(correlation / (2.0 * length), 0.5 / _MIN_BLOCK_OVER_CORRELATION)
             corrected = estimated / (1.0 - np.where(correlation > 1.5, at_borders, 0.0))
-            enough = usable & (length >= _MIN_CORRELATION_TIMES * correlation)
+            enough = usable & (length >= _MIN_BLOCK_OVER_CORRELATION * correlation)
             larger = usable & ~enough & (corrected > variances)
             take = enough | larger
             variances = np.where(take, corrected, variances)
@@ -160,9 +160,9 @@ class NormalEquations(SecondMoments):
             found |= enough
             has_motion = (
                 self._absorbed_degrees_of_freedom(between, inverse)
-                >= _MIN_ABSORBED_SHARE * sample_absorbed
+                >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_absorbed
             )
-            is_longest = has_motion & (counted >= _MIN_DEGREES_OF_LONGEST_BLOCKS)
+            is_longest = has_motion & (counted >= _MIN_DOF_OF_LONGEST_BLOCKS)
             longest = np.where(is_longest, estimated, longest)
             longest_degrees = np.where(is_longest, counted, longest_degrees)
             significant = correlation > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(counted, 1.0))
@@ -175,14 +175,14 @@ class NormalEquations(SecondMoments):
         degrees = np.where(weaker, longest_degrees, degrees)
         return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_RESIDUAL**2 * wrench)
 
-    def _pose_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
+    def _static_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
         assert self._resolution is not None
         squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
         min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0]
         s = blocks[:, _SPECIFIC_FORCE_COLUMNS] / count[:, None]
-        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_M_S2).argmax(axis=1)
+        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_WITHIN_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
         sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressors_of_blocks(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
@@ -191,7 +191,7 @@ class NormalEquations(SecondMoments):
         f_ratio = np.divide(
             between, left * within, out=np.zeros(2), where=(left > 0.0) & (within > 0.0)
         )
-        differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), f_ratio) < _F_TEST_LEVEL
+        differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), f_ratio) < _POSE_F_TEST_LEVEL
         degrees = np.where(differ, left, left + repeats)
         squares = np.where(differ, between, squares)
         variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
@@ -200,7 +200,7 @@ class NormalEquations(SecondMoments):
     def _absorbed_degrees_of_freedom(self, between: Array, inverse: Array) -> Array:
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
-    def _unbiased_variances(
+    def _unbiased_residual_variances(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array]:
         w = self._weights
@@ -235,7 +235,7 @@ def identify(
         delay_s: delay [s] that was removed from the motion, only stored in the result.
     """
     equations = NormalEquations(noise)
-    equations.add(wrench, s, omega, alpha)
+    equations.add_samples(wrench, s, omega, alpha)
     return equations.solve(delay_s)
 
 
@@ -248,8 +248,8 @@ def _pseudo_inverse(
 ) -> tuple[Array, NDArray[np.bool_], float]:
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+    kept = eigenvalues > _MIN_RELATIVE_GRAM_EIGENVALUE * eigenvalues[-1]
     half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
-    undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
+    undetermined = (np.abs(vectors[:, ~kept]) > _MAX_DETERMINED_NULL_COMPONENT).any(axis=1)
     condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
     return half @ half.T, undetermined, condition_number

@@ -40,7 +40,7 @@ class FourierTrajectory:
         `sine` and `cosine` (n, N - 1) [rad] are free coefficients; harmonic k is divided by k.
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
-        rest_rho, rest_delta = _make_rest_bases(sine.shape[-1] + 1)
+        rest_rho, rest_delta = _make_rest_coefficient_bases(sine.shape[-1] + 1)
         return cls(np.asarray(q0, float), sine @ rest_rho, cosine @ rest_delta, frequency)
 
     @property
@@ -118,7 +118,7 @@ class FourierTrajectory:
         return cls(q0, rho, delta, frequency)
 
 
-def _make_rest_bases(harmonics: int) -> tuple[Array, Array]:
+def _make_rest_coefficient_bases(harmonics: int) -> tuple[Array, Array]:
     k = np.arange(1.0, harmonics + 1)
     bases = [np.linalg.qr(row[:, np.newaxis], mode="complete")[0][:, 1:] for row in (k**0, k)]
     return (bases[0] / k[:, np.newaxis]).T, (bases[1] / k[:, np.newaxis]).T

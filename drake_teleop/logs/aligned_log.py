@@ -25,8 +25,8 @@ from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pas
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
-_MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
-_EDGE_OVER_KNOT_SPACING = 2.0
+_MAX_KNOWN_DELAY_STD_S = 0.005  # s, standard deviation
+_EDGE_MARGIN_OVER_KNOT_SPACING = 2.0
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
@@ -64,7 +64,7 @@ def fit_motion_to_known_load(
         found, source = _fit_with_usual_delay_if_undetermined(
             log, delay, motion_at_delay, usual_s, "load"
         )
-        return (found, source) if found.is_imu_consistent else None
+        return (found, source) if found.is_imu_consistent_with_poses else None
     return None
 
 
@@ -77,7 +77,7 @@ def _fit_with_usual_delay_if_undetermined(
 ) -> tuple[_PoseMotionT, str]:
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
-    if known is None and not found.delay_deviation_s < _MAX_DELAY_DEVIATION_S:
+    if known is None and not found.delay_std_s < _MAX_KNOWN_DELAY_STD_S:
         return motion(usual_s), usual
     return found, source
 
@@ -95,7 +95,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
         angular_acceleration=alpha,
         gravity=splines.gravity(t, gravity_W),
     )
-    stamps, margin = splines.poses.t, _EDGE_OVER_KNOT_SPACING * splines.spacing
+    stamps, margin = splines.poses.t, _EDGE_MARGIN_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
     change = np.zeros(len(t) + 1)

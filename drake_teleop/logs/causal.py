@@ -11,7 +11,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-_ROOT_OF_2, _ROOT_4_OF_3 = math.sqrt(2.0), 3.0**0.25
+_ROOT_OF_2, _FOURTH_ROOT_OF_3 = math.sqrt(2.0), 3.0**0.25
 CAUSAL_MODES = ("delayed", "predicted")
 
 
@@ -67,7 +67,7 @@ def design_low_pass(dt, tangent, ahead_s, low_pass):
     `tangent` is tan(pi cutoff dt).
     """
     k = 2.0 / dt
-    w = k * tangent / _ROOT_4_OF_3
+    w = k * tangent / _FOURTH_ROOT_OF_3
     square, damping = w * w, _ROOT_OF_2 * w * k
     a = k * k + damping + square
     low_pass[0] = (square + ahead_s * square * k) / a
@@ -83,7 +83,7 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay of `causal_low_pass` for slow signals [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
-    return _ROOT_OF_2 / (2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _ROOT_4_OF_3)
+    return _ROOT_OF_2 / (2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _FOURTH_ROOT_OF_3)
 
 
 def compute_causal_wrench(

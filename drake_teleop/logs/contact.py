@@ -18,7 +18,7 @@ from drake_teleop.load.contact.detection import (
     statistics_of_log,
 )
 from drake_teleop.load.contact.noise_floor import (
-    THRESHOLD_MARGIN,
+    THRESHOLD_OVER_MAX,
     DetectorSamples,
     NoiseFloor,
     statistic_index,
@@ -32,17 +32,17 @@ MIN_NOISE_FLOOR_SAMPLES = 100
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
-_MAX_GRAVITY_FREQUENCY_HZ = 0.5
-_MAX_QUIET_DEVIATIONS = 4.0
-_DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
-_BLOCK_DURATION_S, _MIN_NUM_BLOCKS = 0.1, 20
-_CONCENTRATION_STEPS, _NUM_FLOOR_ROUNDS = 4, 3
-_RECORD_THRESHOLD_MARGIN, _MIN_REACHED_STATISTIC = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
+_GRAVITY_LOW_PASS_HZ = 0.5
+_MAX_QUIET_WRENCH_OVER_NOISE = 4.0
+_CUTOFF_WITHOUT_LOW_PASS_HZ = 30.0  # assumed cut-off without a low-pass
+_MIN_FLOOR_BLOCK_DURATION_S, _MIN_FLOOR_BLOCKS = 0.1, 20
+_QUIET_HALF_ITERATIONS, _NUM_CONTACT_REMOVAL_ROUNDS = 4, 3
+_THRESHOLD_OVER_MAXIMUM, _MIN_STATISTIC_MAXIMUM = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
 _MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
-_MAX_CONTACT_SHARE, _MAX_FLOOR_OVER_RESIDUAL = 0.4, 10.0
+_MAX_CONTACT_SHARE, _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
-_MIN_CONTACT_SHARE_FOR_SHIFT = 0.2
+_MIN_CONTACT_SHARE_FOR_OFFSET_NOTE = 0.2
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,20 @@ class Detection:
     """Contact in a log of N samples.
 
     Attributes:
-        floor: noise floor of the free motion.
+        noise_floor: that of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
         statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
-        free_s: duration of the free motion that determined the floor [s].
+        free_duration_s: duration of the free motion that determined the floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
     """
 
-    floor: NoiseFloor
+    noise_floor: NoiseFloor
     statistic: str
     threshold: float
     statistics: Array
     touched: NDArray[np.bool_]
-    free_s: float
+    free_duration_s: float
     force_threshold: float
     notes: tuple[str, ...] = ()
 
@@ -78,7 +78,7 @@ def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> D
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
-        gravity = -low_pass(log.specific_force, log.dt, _MAX_GRAVITY_FREQUENCY_HZ)
+        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_LOW_PASS_HZ)
     return DetectorSamples(contact, s, omega, alpha, s + gravity)
 
 
@@ -99,7 +99,7 @@ def detect_contact(
     `covariance` (16, 16) is that of [offsets; phi], `usual` (6,) the RMS residual of the
     identification [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
-    period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
+    period = 1.0 / (cutoff_hz or _CUTOFF_WITHOUT_LOW_PASS_HZ)
     inner = _select_judged_samples(rows, dt, period, edge)
     judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
@@ -108,7 +108,7 @@ def detect_contact(
     # A held value decays by the factor e within a period.
     if free is None:
         fade = math.exp(-dt / period)
-        floor, threshold, train = _fit_record_floor(judged, dt, hold, fade, covariance, statistic)
+        floor, threshold, train = _fit_floor_to_log(judged, dt, hold, fade, covariance, statistic)
     else:
         train = free[0].select_rows(_select_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
@@ -120,13 +120,13 @@ def detect_contact(
     if free is None:
         _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
     return Detection(
-        floor=floor,
+        noise_floor=floor,
         statistic=statistic,
         threshold=threshold,
         statistics=values,
         touched=touched,
-        free_s=len(train.contact) * (dt if free is None else free[1]),
-        force_threshold=THRESHOLD_MARGIN
+        free_duration_s=len(train.contact) * (dt if free is None else free[1]),
+        force_threshold=THRESHOLD_OVER_MAX
         * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
         notes=() if free is not None else _detection_notes(floor, touched, usual),
     )
@@ -144,41 +144,41 @@ def _select_judged_samples(
     return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
-def _fit_record_floor(
+def _fit_floor_to_log(
     rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
-    block = max(hold, round(_BLOCK_DURATION_S / dt))
+    block = max(hold, round(_MIN_FLOOR_BLOCK_DURATION_S / dt))
     selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_FLOOR_SAMPLES) == 0
-    quiet = _is_below_noise_limit(rows.contact, noise_floor(rows.contact))
+    quiet = _find_quiet_samples(rows.contact, noise_floor(rows.contact))
     if (quiet & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
         quiet = selected = np.ones(n, bool)
-    for _ in range(_CONCENTRATION_STEPS if n >= _MIN_NUM_BLOCKS * block else 0):
+    for _ in range(_QUIET_HALF_ITERATIONS if n >= _MIN_FLOOR_BLOCKS * block else 0):
         floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
         half = _quieter_half_of_blocks(statistics_of_log(floor, *rows)[:, 0], block)
         if (half & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
             break
         quiet = half
-    for attempt in range(_NUM_FLOOR_ROUNDS):
+    for attempt in range(_NUM_CONTACT_REMOVAL_ROUNDS):
         train = rows.select_rows(quiet & selected)
         floor = fit_noise_floor(*train, covariance, fade=fade)
         values = statistics_of_log(floor, *train)[:, statistic_index(statistic)]
-        reached = _extrapolated_maximum(values, block, n)
+        reached = _expected_maximum_in_free_motion(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
-        reached = max(_MIN_REACHED_STATISTIC, reached)
+        reached = max(_MIN_STATISTIC_MAXIMUM, reached)
         detector = ContactDetector(
-            floor, THRESHOLD_MARGIN * reached, statistic=statistic, hold=hold
+            floor, THRESHOLD_OVER_MAX * reached, statistic=statistic, hold=hold
         )
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
         if (
             selected & without_contact
-        ).sum() < MIN_NOISE_FLOOR_SAMPLES or attempt == _NUM_FLOOR_ROUNDS - 1:
+        ).sum() < MIN_NOISE_FLOOR_SAMPLES or attempt == _NUM_CONTACT_REMOVAL_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _RECORD_THRESHOLD_MARGIN * reached, rows.select_rows(quiet)
+    return floor, _THRESHOLD_OVER_MAXIMUM * reached, rows.select_rows(quiet)
 
 
 def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
@@ -187,7 +187,7 @@ def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
     return np.asarray((power <= np.median(power))[of])
 
 
-def _extrapolated_maximum(values: Array, block: int, samples: int) -> float:
+def _expected_maximum_in_free_motion(values: Array, block: int, samples: int) -> float:
     """Return the expected maximum of `values` in free motion over `samples` samples, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
@@ -209,7 +209,7 @@ def _remove_marginal_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):
-        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_MARGIN * threshold:
+        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_OVER_MAX * threshold:
             touched[start:stop] = False
 
 
@@ -223,7 +223,7 @@ def _detection_notes(
             f" determine the noise floor{remedy}",
         )
     noise_ratio = float((floor.noise / np.maximum(usual, _MIN_NOISE_FLOOR)).max())
-    if noise_ratio > _MAX_FLOOR_OVER_RESIDUAL:
+    if noise_ratio > _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL:
         return (
             f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"
             " identification: most of the record may be in contact, which is not detected"
@@ -235,7 +235,7 @@ def _detection_notes(
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
-    if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_SHIFT:
+    if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
         return ()
     return (
         f"the offsets of the record differ by {force:.2g} N from those of the free motion: either"
@@ -267,15 +267,15 @@ def noise_floor(contact: Array) -> Array:
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet
-        quiet = _is_below_noise_limit(contact, np.maximum(floor, _MIN_NOISE_FLOOR))
+        quiet = _find_quiet_samples(contact, np.maximum(floor, _MIN_NOISE_FLOOR))
         if np.array_equal(before, quiet) or not quiet.any():
             break
         floor = np.sqrt(np.mean(contact[quiet] ** 2, axis=0))
     return np.maximum(floor, _MIN_NOISE_FLOOR)
 
 
-def _is_below_noise_limit(contact: Array, floor: Array) -> NDArray[np.bool_]:
-    return np.asarray((np.abs(contact) <= _MAX_QUIET_DEVIATIONS * floor).all(axis=1))
+def _find_quiet_samples(contact: Array, floor: Array) -> NDArray[np.bool_]:
+    return np.asarray((np.abs(contact) <= _MAX_QUIET_WRENCH_OVER_NOISE * floor).all(axis=1))
 
 
 def summarize_contacts(

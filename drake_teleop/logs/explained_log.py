@@ -20,7 +20,7 @@ from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
+from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passed_by_splines
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
@@ -30,7 +30,7 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
-_MAX_MASS_KG = 1000.0
+_MAX_PLAUSIBLE_MASS_KG = 1000.0
 _SIGN_FIELD = "wrench.sign"
 _FRAME_FIELD = "wrench.frame"
 _WEIGHT_FIELD = "wrench.weight"
@@ -44,7 +44,7 @@ _UNIT_RATIO_TOLERANCE = 1e-3
 _POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
 _ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
 _DECIMALS_OF_FIELD = {_GRAVITY_FIELD: 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
-_REMEDY_WITHOUT_FIELD = {
+_REMEDY_OF_CAUSE_WITHOUT_FIELD = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
     "pose frame": "add the position to pose, or an accelerometer",
@@ -62,7 +62,7 @@ def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
     """Return a message on wrong units for a mass above 1000 kg, None for a smaller one."""
-    if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
+    if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
     ratio = fields[_TORQUE_SCALE_FIELD] / fields[_FORCE_SCALE_FIELD]
@@ -72,7 +72,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{note_for_table(log)}"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{yaml_only_note(log)}"
     )
 
 
@@ -96,12 +96,12 @@ def _correct_fields(
             {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
-        otherwise = _REMEDY_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{note_for_table(log)}" if lines else otherwise)
+        otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
+        texts.append(f"set {lines}{yaml_only_note(log)}" if lines else otherwise)
     return fields, texts, corrected
 
 
-def note_for_table(log: Log) -> str:
+def yaml_only_note(log: Log) -> str:
     return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
@@ -219,9 +219,9 @@ _CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], No
 }
 
 
-_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
-_MIN_ROWS = 100
-_MIN_WIDENING_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
+_MIN_INSTANTS_TO_EXPLAIN = 100
+_MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
 _BLOCK_MEAN_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
@@ -235,7 +235,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
         return block_means_of_log(remove_delay(log, late))
 
     data = instants_at_delay(0.0)
-    if data.used.sum() < _MIN_ROWS:
+    if data.used.sum() < _MIN_INSTANTS_TO_EXPLAIN:
         return None
     why = explain_misfit(data, instants_at_delay, log.estimated)
     if log.described is None:
@@ -255,22 +255,22 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN_OVER_KNOT_SPACING * splines.spacing
+    stamps, margin = splines.poses.t, _SPLINE_END_MARGIN_OVER_KNOT_SPACING * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
     return block_means_of_record(
-        log.t, log.wrench, motion_at, gravity, lost, _acceleration_noise(splines)
+        log.t, log.wrench, motion_at, gravity, lost, _noise_of_spline_acceleration(splines)
     )
 
 
-def _acceleration_noise(splines: PoseSplines) -> float:
+def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BLOCK_MEAN_BANDWIDTH_HZ, 500)
-    share = passed_noise_share(f, splines.spacing)
+    share = noise_share_passed_by_splines(f, splines.spacing)
     if splines.imu_rows is not None:
-        share = share * splines.imu_rows.remaining_noise_shares(f)[0]
+        share = share * splines.imu_rows.pose_noise_shares_left_by_imu(f)[0]
     power = (
         2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
     )
@@ -297,7 +297,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_DEVIATION_RATIO:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MIN_WIDENING_STD_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)

@@ -12,9 +12,9 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import (
     PARAMETER_NAMES,
-    SIGNIFICANT_DEVIATIONS,
+    SIGNIFICANT_STDS_BELOW_ZERO,
     Identification,
-    com_deviations,
+    com_standard_deviations,
     consistency_margin,
 )
 from drake_teleop.load.inertia import mass_com_inertia
@@ -50,7 +50,7 @@ def summarize_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
         "mass": mass,
         "mass_std": deviations[0],
         "com": com,
-        "com_std": com_deviations(stretch.phi, stretch.covariance),
+        "com_std": com_standard_deviations(stretch.phi, stretch.covariance),
         "phi": stretch.phi,
         "phi_std": deviations,
     }
@@ -63,14 +63,14 @@ def summarize_load(load: Identification) -> dict[str, Any]:
         "mass": load.mass,
         "mass_std": deviations[6],
         "com": load.com,
-        "com_std": com_deviations(load.phi, load.covariance),
+        "com_std": com_standard_deviations(load.phi, load.covariance),
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
         "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
-        "identifiable": _names_of_parameters(load, True),
-        "not_identifiable": _names_of_parameters(load, False),
+        "identifiable": _names_by_identifiability(load, True),
+        "not_identifiable": _names_by_identifiability(load, False),
         "physically_consistent": load.physically_consistent,
     }
 
@@ -85,7 +85,7 @@ def summarize_object_alone(alone: Identification) -> dict[str, Any]:
 
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < SIGNIFICANT_DEVIATIONS * deviation:
+    if alone.mass < SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         return [
             f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
             f" ± {deviation:.2g} kg"
@@ -93,7 +93,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
-    if margin < -SIGNIFICANT_DEVIATIONS * deviation:
+    if margin < -SIGNIFICANT_STDS_BELOW_ZERO * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"
@@ -101,7 +101,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _names_of_parameters(result: Identification, identifiable: bool) -> list[str]:
+def _names_by_identifiability(result: Identification, identifiable: bool) -> list[str]:
     pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
@@ -161,7 +161,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
     return figures
 
 
-def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
     wrenches = {
         "raw": found.measured - found.measured[0],

@@ -26,15 +26,15 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
 
-GAP_BANDWIDTH_HZ = 30.0
+BANDWIDTH_FOR_GAP_LENGTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
-MIN_REPEATED_SHARE = 0.05
+MIN_REPEATED_ROW_SHARE = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
 MIN_REPEATED_BLOCK_ROWS = 5
-_MAX_CORRECTIONS = 5
+_MAX_DRAFT_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
 _CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
-_QUANTITY_NAMES = (
+_INSPECTED_QUANTITIES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
 )
@@ -95,12 +95,12 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         )
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not _are_names_numbers(list(table.columns))
+    header = not _are_column_names_numbers(list(table.columns))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
 
-def _are_names_numbers(names: Sequence[str]) -> bool:
+def _are_column_names_numbers(names: Sequence[str]) -> bool:
     with suppress(ValueError):
         for name in names:  # polars adds a suffix to repeated names
             float(name.partition("_duplicated_")[0])
@@ -128,7 +128,7 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
 
 def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
     tables: dict[Path, Table] = {}
-    for _ in range(_MAX_CORRECTIONS):
+    for _ in range(_MAX_DRAFT_CORRECTIONS):
         found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
         finding = next((finding for finding in found if finding.fields), None)
         if finding is None:
@@ -178,7 +178,7 @@ def _inspect_stream(
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
-        for field in _QUANTITY_NAMES
+        for field in _INSPECTED_QUANTITIES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
     values = table.numbers_with_nan_side_by_side(columns, f"{source}:{name}")
@@ -234,7 +234,7 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK_ROWS
+    enough = same.mean() > MIN_REPEATED_ROW_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest_run(same)
@@ -270,7 +270,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > min_gap_length_s(median, GAP_BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,

@@ -46,7 +46,7 @@ VERDICT_WORDS = dict(
         strict=True,
     )
 )
-_MAX_POINTS, _MAX_WELCH_WINDOW = 4000, 2**14
+_MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED_COLOUR = "#A3AAB5"
 
@@ -126,7 +126,7 @@ def amplitude_spectral_densities(x: Array, dt: float) -> tuple[Array, Array]:
     """
     from scipy.signal import welch
 
-    length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW)
+    length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW_SAMPLES)
     rates, power = welch(x, 1.0 / dt, nperseg=length, axis=0)
     return rates[1:], np.sqrt(power[1:])
 
@@ -253,7 +253,7 @@ def _draw_curves(
     axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static: bool
 ) -> None:
     # More points than pixels only make the drawing slow.
-    every = max(1, len(t) // _MAX_POINTS)
+    every = max(1, len(t) // _MAX_CURVE_POINTS)
     for order, (name, values, colour) in enumerate(curves):
         if static:
             size = 7.0 if order == 0 else 3.0

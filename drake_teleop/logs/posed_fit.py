@@ -20,16 +20,16 @@ from drake_teleop.logs.aligned_log import (
 )
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
-from drake_teleop.logs.explained_log import note_for_table
+from drake_teleop.logs.explained_log import yaml_only_note
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
-_MIN_NOISE_OVER_WRENCH = 1e-9
+_MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
 # Fewest kept samples, and largest cut-off of the low-pass over their rate.
-_MIN_KEPT_SAMPLES, _CUTOFF_OVER_KEPT_RATE = 400_000, 0.25
+_MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
 _CHUNK_SAMPLES, _FILTER_NEIGHBOURS = (
     2**14,
     2**8,
@@ -66,10 +66,10 @@ def fit_load_to_posed_log(
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
-        if not found.is_imu_consistent or (finding is not None and not rotated):
+        if not found.is_imu_consistent_with_poses or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
-    moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
+    moved, one_sided = use_spline_motion(_reduce_log_rate(log, cutoff_hz), found)
     shown = low_pass_log(moved, cutoff_hz).select_rows(far_from_gaps(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
@@ -79,15 +79,15 @@ def fit_load_to_posed_log(
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        finding = replace(finding, message=f"{finding.message}{note_for_table(log)}")
+        finding = replace(finding, message=f"{finding.message}{yaml_only_note(log)}")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
 
-def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
-    stride = len(log) // _MIN_KEPT_SAMPLES
+def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
+    stride = len(log) // _MIN_SAMPLES_AT_REDUCED_RATE
     if cutoff_hz is not None:
-        stride = min(stride, int(_CUTOFF_OVER_KEPT_RATE / (cutoff_hz * log.dt)))
+        stride = min(stride, int(_MAX_CUTOFF_OVER_REDUCED_RATE / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
     few = log.select_rows(slice(None, None, stride))
@@ -105,12 +105,12 @@ def _batch_result_of_estimate(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
     kept = ~rejected
-    theta = _consistent_parameters(found) if method == "consistent" else found.theta
+    theta = _physically_consistent_theta(found) if method == "consistent" else found.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_OVER_WRENCH * size + 1e-30))
-    equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
+    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
+    equations.add_samples(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()
     unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(covariance))
@@ -128,7 +128,7 @@ def _batch_result_of_estimate(
     return BatchResult(load, noise, rejected, _note_on_estimate(found, gain_std), equations)
 
 
-def _consistent_parameters(found: PoseEstimate) -> Array:
+def _physically_consistent_theta(found: PoseEstimate) -> Array:
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta
@@ -144,6 +144,6 @@ def _note_on_estimate(found: PoseEstimate, stated: float) -> str:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(
             f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.deviation_inflation:.2g} times as large as by noise"
+            f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"
         )
     return "; ".join(notes)

@@ -65,12 +65,12 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
-_CAUSES_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
+_CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_MAX_CONSTANT_CHANNEL_CHANGE = 1e-6  # largest relative change of a constant channel
+_CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
-_MIN_DELAY_DEVIATIONS = 5.0  # standard deviations
-_MAX_SCALE = 100.0  # as in `ForceScalingConfig`
+_MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
+_MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
 _SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
@@ -87,7 +87,7 @@ class IdentifiedLog:
         findings: suspected errors of the log description.
         causes: effects beside a rigid load with constant offsets that the fit includes.
         loads: load of each part of the record, if it changes.
-        delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
+        delay_std_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
 
     log: Log
@@ -99,7 +99,7 @@ class IdentifiedLog:
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
     loads: tuple[RecordPartWithLoad, ...] = ()
-    delay_deviation_s: float = float("nan")
+    delay_std_s: float = float("nan")
 
     def __repr__(self) -> str:
         return repr(self.identification)
@@ -221,7 +221,7 @@ def _read_and_identify_log(
     if (
         why is not None
         and log.gain_std > 0.0
-        and {x.name for x in why.causes} <= _CAUSES_BY_GAIN_ERRORS
+        and {x.name for x in why.causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
     ):
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
@@ -267,13 +267,13 @@ def _read_and_identify_log(
         findings,
         causes,
         loads,
-        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation_s,
+        delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
-    if log.static or (high - low <= _MAX_CONSTANT_CHANNEL_CHANGE * np.maximum(high, -low)).any():
+    if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -290,7 +290,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
         return checks
     findings, delay = checks.findings, checks.delay_s
-    deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
+    deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
@@ -305,7 +305,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         findings = tuple(finding for finding in findings if finding.name != "lag")
         if not findings:
             delay = own_delay
-            if abs(delay) > _MIN_DELAY_DEVIATIONS * deviation:
+            if abs(delay) > _MIN_REPORTED_DELAY_OVER_STD * deviation:
                 findings = tuple(lag_finding(description, delay))
     return replace(checks, findings=findings, delay_s=delay)
 
@@ -454,7 +454,7 @@ def _read_and_eliminate_log(
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     span = (
-        slice(None) if untouched_s is None else _rows_between(log.select_rows(known), *untouched_s)
+        slice(None) if untouched_s is None else _rows_in_span(log.select_rows(known), *untouched_s)
     )
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
@@ -522,7 +522,7 @@ def _read_and_eliminate_log(
     )
 
 
-def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
+def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
@@ -599,9 +599,9 @@ def _checked_scales(
 ) -> dict[str, float | None]:
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
-        if value is not None and not 0.0 <= to_float(name, value) <= _MAX_SCALE:
+        if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
             raise DrakeTeleopError(
-                f"{value:g} is outside 0 to {_MAX_SCALE:g}",
+                f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}",
                 where=name,
                 remedy="give a scale, such as 0 or 1",
             )

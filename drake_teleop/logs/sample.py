@@ -37,8 +37,8 @@ CLOCK_START_S = 48213.4
 """Time of the controller's clock at the sensor's time 0 [s]."""
 
 WRENCH_HZ, POSE_HZ = 500.0, 125.0
-PERIOD_S, REST_S = 8.0, 0.5
-_JITTER_S = 5e-5
+MOTION_PERIOD_S, REST_AT_ENDS_S = 8.0, 0.5
+_MAX_CLOCK_JITTER_S = 5e-5
 
 # UR5e, Denavit-Hartenberg parameters of the manufacturer: d, a [m], alpha [rad].
 _DH_PARAMETERS = np.array(
@@ -53,7 +53,7 @@ _DH_PARAMETERS = np.array(
 )
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
-_NUM_HARMONICS = 6
+_NUM_RECORD_HARMONICS = 6
 TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
 
@@ -133,7 +133,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
         summary = {
             "seed": seed,
             "files": [*files, "truth.json"],
-            "duration_s": PERIOD_S + 2 * REST_S,
+            "duration_s": MOTION_PERIOD_S + 2 * REST_AT_ENDS_S,
             "wrench_hz": WRENCH_HZ,
             "pose_hz": POSE_HZ,
         }
@@ -185,7 +185,7 @@ _Motion: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
 def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
     random = np.random.default_rng([2009, number])
-    return _random_motion(random, 0.5, _NUM_HARMONICS, PERIOD_S, REST_S)
+    return _random_motion(random, 0.5, _NUM_RECORD_HARMONICS, MOTION_PERIOD_S, REST_AT_ENDS_S)
 
 
 def _random_motion(
@@ -226,8 +226,8 @@ def _axis_rotations(angle: Array, axis: int) -> Array:
 
 
 def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
-    t = np.arange(round((PERIOD_S + 2 * REST_S) * rate_hz)) / rate_hz
-    return t + _JITTER_S * random.uniform(0, 1, len(t))
+    t = np.arange(round((MOTION_PERIOD_S + 2 * REST_AT_ENDS_S) * rate_hz)) / rate_hz
+    return t + _MAX_CLOCK_JITTER_S * random.uniform(0, 1, len(t))
 
 
 def _write_wrench(
@@ -267,7 +267,7 @@ def _write_columns(path: Path, names: str, columns: list[Array], digits: int) ->
 
 _POSE_NOISE_STD = np.repeat([5e-5, 2e-4], 3)  # m, rad
 _EPISODE_HARMONICS, _EPISODE_REST_S = 5, 0.2
-_MIN_CONTACT_N = 0.5
+_MIN_CONTACT_FORCE_N = 0.5
 
 
 class SampleEpisode(NamedTuple):
@@ -316,5 +316,5 @@ def sample_episode(
     noise = _POSE_NOISE_STD * random.normal(size=(len(t), 6))
     turned = Rotation.from_matrix(R_late) * Rotation.from_rotvec(noise[:, 3:])
     quaternion = turned.as_quat()[:, [3, 0, 1, 2]]
-    touched = np.linalg.norm(contact[:, :3], axis=1) > _MIN_CONTACT_N
+    touched = np.linalg.norm(contact[:, :3], axis=1) > _MIN_CONTACT_FORCE_N
     return SampleEpisode(t, p_late + noise[:, :3], quaternion, wrench, contact, touched)

@@ -156,7 +156,7 @@ def advise_motion(
     """
     rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
     equations = NormalEquations(noise)
-    equations.add(np.zeros((len(motion[0]), 6)), *motion)
+    equations.add_samples(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
     size = np.sqrt(np.diag(gram).max()) + 1.0
     gram = gram + _RELATIVE_GRAM_REGULARIZATION * size**2 * np.eye(16)

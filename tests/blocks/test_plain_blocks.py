@@ -51,7 +51,7 @@ CONFIG = ForceScalingConfig(sigma_weight=0.5, sigma_inertia=0.2, gamma=1.5, forc
 
 def floor() -> NoiseFloor:
     parts = np.full(6, 0.1), np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.zeros(6)
-    return NoiseFloor(*parts, reached=np.full(3, 30.0))
+    return NoiseFloor(*parts, free_maxima=np.full(3, 30.0))
 
 
 EXAMPLES = {

@@ -41,7 +41,7 @@ def floor() -> NoiseFloor:
         np.full((6, 2), 0.01),
         np.eye(6),
         np.full(6, 0.2),
-        reached=np.array([5.0, 8.0, 6.0]),
+        free_maxima=np.array([5.0, 8.0, 6.0]),
     )
 
 
@@ -131,5 +131,5 @@ def test_station_without_detector_has_no_contact_signal(identified):
     with pytest.raises(DrakeTeleopError, match=r"contact_detection: .*pass noise_floor"):
         MakeTeleopStation(scenario, load_estimate=estimate)
     unfitted = NoiseFloor(NOISE, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.zeros(6))
-    with pytest.raises(DrakeTeleopError, match="reached"):
+    with pytest.raises(DrakeTeleopError, match="free_maxima"):
         MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=unfitted)

@@ -12,7 +12,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import (
-    FADE_TIME_S,
+    LOAD_FADE_TIME_S,
     STATE_DISTURBED,
     STATE_LEARNING,
     STATE_OTHER_LOAD,
@@ -147,7 +147,7 @@ def test_estimate_changes_without_a_step(grasped):
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
     watched = grasped.t > first(grasped, STATE_SETTLED) + 0.01
     steps = np.abs(np.diff(phi[watched], axis=0))
-    assert (steps <= 1e-3 / FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
+    assert (steps <= 1e-3 / LOAD_FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import METHODS, _std_growth_by_rejection, identify_batch
 from drake_teleop.load.batch.total_least_squares import EstimatorOptions, SampleRecord
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
+from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (
     is_physically_consistent,
@@ -277,7 +277,7 @@ def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
     def solved(F, **stated):
         return identify_batch(F, *motion, method=method, noise=noise, offsets=offsets, **stated)
 
-    expected, length = np.zeros((16, 16)), np.repeat([1.0, TORQUE_ARM_M], 3)
+    expected, length = np.zeros((16, 16)), np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     for d in range(6):
         for k in range(6):
             wrong = F.copy()
@@ -294,7 +294,7 @@ def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_intervals_hold_with_gains_as_wrong_as_stated(method):
-    rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, TORQUE_ARM_M], 3)
+    rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     exact, *motion = record()
     for seed in range(60):
         gains = np.eye(6) + 0.01 * rng.normal(size=(6, 6)) * np.outer(length, 1.0 / length)

@@ -28,7 +28,7 @@ def fit(phi, noise=0.0, seed=0):
     F = OFFSETS + non_contact_wrench(*motion, phi)
     F = F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape)
     moments = SecondMoments()
-    moments.add(F, *motion)
+    moments.add_samples(F, *motion)
     return total_least_squares(moments, NoiseStd(), WRENCH_NOISE)
 
 

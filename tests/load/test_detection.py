@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import (
     CONTACT_END_LEVEL,
-    DEFAULT_SLACK,
+    CUSUM_SLACK,
     MEMORY_SIZE,
     ContactDetector,
     central_axis_of_wrenches,
@@ -113,7 +113,7 @@ def test_a_planted_floor_is_found(seed):
     np.testing.assert_allclose(found.per_acceleration, growth, rtol=0.1)
     np.testing.assert_allclose(found.correlation, true.correlation, atol=0.03)
     np.testing.assert_allclose(found.rho, 0.0, atol=0.03)
-    np.testing.assert_allclose(found.widths, 1.0, atol=0.1)
+    np.testing.assert_allclose(found.sum_widths, 1.0, atol=0.1)
     level = statistics_of_log(found, contact, *motion)[:, 0]
     # Its square is chi-squared, slow or fast.
     for rows in (np.linalg.norm(motion[3], axis=1) < 2.0, np.linalg.norm(motion[3], axis=1) > 5.0):
@@ -144,9 +144,9 @@ def test_a_slow_error_does_not_set_the_threshold_of_quick_contacts():
     slow = 0.7 * np.sin(np.arange(n)[:, None] * 1e-3 * rng.uniform(1.0, 3.0, 6))
     noise = (rng.normal(size=(n, 6)) + slow) * NOISE
     found = fit_noise_floor(noise, *at_rest(n), np.zeros((16, 16)))
-    assert found.widths[0] == pytest.approx(1.0, abs=0.05)
-    assert found.widths[-1] > 2.0
-    blind = replace(found, widths=np.ones(len(found.widths)))
+    assert found.sum_widths[0] == pytest.approx(1.0, abs=0.05)
+    assert found.sum_widths[-1] > 2.0
+    blind = replace(found, sum_widths=np.ones(len(found.sum_widths)))
     quick = noise.copy()
     quick[500::1000, 0] += 6.0 * NOISE[0]
     quick[501::1000, 0] += 6.0 * NOISE[0]
@@ -355,7 +355,7 @@ def test_an_update_is_one_sample():
     memory, floor = np.zeros(MEMORY_SIZE), white(0.5)
     for count in (1.0, 2.0):
         update_statistics(
-            memory, NOISE, *STILL, floor.compiled_parameters, DEFAULT_SLACK, 0.0, CONTACT_END_LEVEL
+            memory, NOISE, *STILL, floor.compiled_parameters, CUSUM_SLACK, 0.0, CONTACT_END_LEVEL
         )
         assert memory[0] == count
 

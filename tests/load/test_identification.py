@@ -76,8 +76,8 @@ def test_chunks_and_order_do_not_matter():
     whole = identify(F, *motion, noise=NOISE)
     in_chunks = NormalEquations(NOISE)
     for part in np.split(np.arange(3000), [1, 2, 700, 701, 2222]):
-        in_chunks.add(F[part], *(x[part] for x in motion))
-    in_chunks.add(F[:0], *(x[:0] for x in motion))
+        in_chunks.add_samples(F[part], *(x[part] for x in motion))
+    in_chunks.add_samples(F[:0], *(x[:0] for x in motion))
     chunked = in_chunks.solve()
     np.testing.assert_allclose(estimate(chunked), estimate(whole), rtol=0, atol=1e-12)
     np.testing.assert_allclose(chunked.covariance, whole.covariance, rtol=1e-9, atol=1e-15)
@@ -110,7 +110,7 @@ def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
     equations = NormalEquations(weights**-0.5)
-    found, degrees = equations._unbiased_variances(power, n, grams, grams, inverse)
+    found, degrees = equations._unbiased_residual_variances(power, n, grams, grams, inverse)
     np.testing.assert_allclose(found, variances, rtol=1e-9)
     assert degrees.sum() == pytest.approx(6 * n - 16)
 

@@ -29,7 +29,7 @@ def noisy(clean, seed):
 
 def moments_of(arrays, **weights):
     moments = SecondMoments()
-    moments.add(*arrays, **weights)
+    moments.add_samples(*arrays, **weights)
     return moments
 
 
@@ -81,7 +81,7 @@ def test_scale_says_how_wrong_the_stated_noise_is():
     moments = moments_of(noisy(record(4000), 5))
     stated = NoiseStd(s=0.05, omega=0.015, alpha=1.5)
     form = total_least_squares(moments, stated, 0.5 * WRENCH_NOISE)
-    assert form.scale == pytest.approx(4.0, rel=0.05)
+    assert form.noise_scale == pytest.approx(4.0, rel=0.05)
     right = total_least_squares(moments, NOISE, WRENCH_NOISE)
     np.testing.assert_allclose(form.theta, right.theta, rtol=1e-6, atol=1e-8)
 

@@ -25,7 +25,7 @@ from drake_teleop.load.batch.uncertainty import (
 from drake_teleop.load.identification import (
     PARAMETER_NAMES,
     Identification,
-    com_deviations,
+    com_standard_deviations,
     natural_scales,
 )
 from drake_teleop.load.normal_equations import NormalEquations, identify
@@ -52,7 +52,7 @@ def equations_of(motion, noise=0.0, seed=0):
     equations = NormalEquations(NOISE)
     ideal = OFFSETS + non_contact_wrench(*motion, TOOL)
     random = np.random.default_rng(seed).normal(size=ideal.shape)
-    equations.add(ideal + noise * NOISE * random, *motion)
+    equations.add_samples(ideal + noise * NOISE * random, *motion)
     return equations
 
 
@@ -109,7 +109,7 @@ def test_long_run_variance_of_known_noise():
     colour = "AR(1) 0.9, 1 kHz"
     noise = NOISE * study.coloured_noise(np.random.default_rng(5), 60_000, colour)
     equations = NormalEquations(NOISE)
-    equations.add(OFFSETS + non_contact_wrench(*motion, TOOL) + noise, *motion)
+    equations.add_samples(OFFSETS + non_contact_wrench(*motion, TOOL) + noise, *motion)
     variances, degrees = equations.long_run_variances(TRUTH)
     # (1 + 0.9) / (1 - 0.9) = 19; the relative deviation of a variance is sqrt(2 / degrees).
     errors = (variances / NOISE**2 / 19.0 - 1.0) / np.sqrt(2.0 / degrees)
@@ -154,7 +154,7 @@ def test_slow_noise_is_told():
 
     def slow(noise):
         equations = NormalEquations(NOISE)
-        equations.add(ideal + NOISE * noise, *motion)
+        equations.add_samples(ideal + NOISE * noise, *motion)
         return base_parameters(equations)
 
     rng = np.random.default_rng(0)
@@ -329,7 +329,7 @@ def test_a_turntable_determines_sums():
     np.testing.assert_allclose(coefficients @ null.T, 0.0, atol=1e-5)
     for c in base.combinations:
         assert abs(c.value - c.coefficients @ TRUTH) < 5 * c.standard_deviation + 1e-6
-        assert c.coefficients[c.leading] == 1.0
+        assert c.coefficients[c.leading_index] == 1.0
     # Of I_zz only I_zz + 0.2 m c_x, and of the mass only m c_x + 0.2 m, have a part in the wrench.
     for known in (unit("I_zz") + LEVER * unit("m c_x"), unit("m c_x") + LEVER * unit("m")):
         solution = np.linalg.lstsq(coefficients.T, known, rcond=None)[0]
@@ -366,7 +366,7 @@ def test_a_full_record_has_nothing_to_add():
         and not base.weak_directions
     )
     assert base.text_lines() == ["16 of 16 combinations of offsets and load are determined"]
-    names = [PARAMETER_NAMES[c.leading] for c in base.combinations]
+    names = [PARAMETER_NAMES[c.leading_index] for c in base.combinations]
     assert names == list(PARAMETER_NAMES)
     load = equations_of(rich_motion(2000), noise=1.0).solve()
     deviations = [c.standard_deviation for c in base.combinations]
@@ -497,10 +497,10 @@ def test_deviation_of_the_centre_of_mass_includes_that_of_the_mass(sign):
         sign * TOOL[:4], covariance[6:10, 6:10], 200_000
     )
     expected = (draws[:, 1:] / draws[:, :1]).std(axis=0)
-    found = com_deviations(np.r_[sign * TOOL[:4], TOOL[4:]], covariance)
+    found = com_standard_deviations(np.r_[sign * TOOL[:4], TOOL[4:]], covariance)
     np.testing.assert_allclose(found, expected, rtol=0.01)
     covariance[8, :] = covariance[:, 8] = 0.0
     covariance[8, 8] = np.inf
-    assert np.isfinite(com_deviations(TOOL, covariance)).tolist() == [True, False, True]
+    assert np.isfinite(com_standard_deviations(TOOL, covariance)).tolist() == [True, False, True]
     covariance[6, 6] = np.inf
-    assert np.isinf(com_deviations(TOOL, covariance)).all()
+    assert np.isinf(com_standard_deviations(TOOL, covariance)).all()

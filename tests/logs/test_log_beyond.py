@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.lib import format as npy
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.logs.inspection import inspect_command
@@ -69,7 +69,7 @@ def message(call) -> str:
     with pytest.raises(DrakeTeleopError) as caught:
         call()
     line = str(caught.value)
-    assert len(line) <= MAX_LINE_LENGTH
+    assert len(line) <= MAX_ERROR_LINE_LENGTH
     assert line.count("cannot be read") <= 1 and line.count("check ") <= 1
     return line
 

@@ -121,9 +121,7 @@ def test_a_lag_counts_from_five_standard_deviations(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float, names: set[str]
 ) -> None:
     path = written(tmp_path, good())
-    found = replace(
-        identify_log(path), delay_source="estimated", delay_deviation_s=deviation, causes=()
-    )
+    found = replace(identify_log(path), delay_source="estimated", delay_std_s=deviation, causes=())
     found = replace(found, identification=replace(found.identification, delay_s=0.003))
     monkeypatch.setattr(processing, "identify_log", lambda *_, **__: found)
     summary = inspect_command(path, tmp_path / "out", quiet=True)

@@ -132,8 +132,8 @@ LIMITS = {
     "read.table_files._MAX_CELLS_IN_MEMORY": 100,
     "read.reading._CONVERTED_CHUNK_ROWS": 300,
     "read.alignment._INTERPOLATED_CHUNK_ROWS": 170,
-    "pose_motion.splines._CHUNK_ROWS": 260,
-    "posed_fit._MIN_KEPT_SAMPLES": 300,
+    "pose_motion.splines._MAX_ROWS_PER_BLOCK": 260,
+    "posed_fit._MIN_SAMPLES_AT_REDUCED_RATE": 300,
     "posed_fit._CHUNK_SAMPLES": 70,
     "posed_fit._FILTER_NEIGHBOURS": 30,
 }

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.rotations import NUM_COLUMNS_OF_FORM, rotation_matrices
+from drake_teleop.common.rotations import NUM_COLUMNS_OF_ROTATION_FORM, rotation_matrices
 from drake_teleop.logs.read.mounting import nonlinear_least_squares
 from drake_teleop.logs.read.streams import OrientationColumns
 
@@ -60,7 +60,7 @@ def test_solve_uses_given_linear_derivatives() -> None:
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-@pytest.mark.parametrize("form", NUM_COLUMNS_OF_FORM)
+@pytest.mark.parametrize("form", NUM_COLUMNS_OF_ROTATION_FORM)
 def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: bool) -> None:
     turns = Rotation.from_rotvec(VECTORS[:5])
     columns = {

@@ -63,7 +63,7 @@ def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
     error = (aid.acceleration_W - acceleration)[100:-100]
     assert np.sqrt((error**2).mean()) == pytest.approx(NOISE[0], rel=0.1)
     assert np.abs(error.mean(axis=0)).max() < 3e-3
-    assert aid.imu_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
+    assert aid.imu_noise_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
 
 
 @pytest.mark.parametrize("size", [1.0, 0.3, 1e-3])
@@ -123,7 +123,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
             np.abs(signal_spectrum(grid, taper, error, len(bands.frequency))) ** 2
         )
         Q = noise_moments(splines, grid, taper, clean, bands, splines.estimate_pose_noise())
-        fast = bands.sums_over_bands(bands.frequency) / bands.sizes > 2.0
+        fast = bands.sums_over_bands(bands.frequency) / bands.band_sizes > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()
             said[k] += np.diagonal(Q, axis1=1, axis2=2)[fast, where].sum()

@@ -37,7 +37,7 @@ from drake_teleop.logs.pose_motion.estimate import (
 )
 from drake_teleop.logs.pose_motion.linear_model import (
     FitWindow,
-    best_delay,
+    find_best_delay,
     fit_linear_model,
     fit_noise_levels,
 )
@@ -46,7 +46,7 @@ from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED_NOTE, find_
 from drake_teleop.logs.pose_motion.rigid import (
     RigidParameters,
     UnitsAndAxes,
-    _apply_step,
+    _add_rigid_step,
     _FitData,
     _parameter_errors_of_unit_gains,
     _residual_and_derivative,
@@ -66,7 +66,12 @@ from drake_teleop.logs.pose_motion.spectra import (
     signal_spectrum,
 )
 from drake_teleop.logs.pose_motion.spectra import exclude_from_taper as exclude_from_taper
-from drake_teleop.logs.pose_motion.splines import SPLINE_DEGREE, PoseSplines, _knots, _thin_knots
+from drake_teleop.logs.pose_motion.splines import (
+    SPLINE_DEGREE,
+    PoseSplines,
+    _place_knots,
+    _remove_knots_without_poses,
+)
 from drake_teleop.logs.read.canonical import Log
 
 
@@ -141,7 +146,7 @@ def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, 
 def test_knots_are_thinned_where_poses_are_too_few():
     """Gaps of all lengths, as on a busy computer, would make the spline undetermined."""
     t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
-    knots = _thin_knots(_knots(t, 0.0125), t)
+    knots = _remove_knots_without_poses(_place_knots(t, 0.0125), t)
     assert (
         np.diff(np.searchsorted(t, knots[SPLINE_DEGREE:-SPLINE_DEGREE])).min() >= 2
         and len(knots) > 80
@@ -193,7 +198,7 @@ def test_noise_moments_predict_the_effect_of_noise():
         sums += second_moments(spectrum, none, bands, rates * spectrum) / 12
     # Below 2 Hz the motion modulates additional noise from higher frequencies.
     whole = NoiseLevels.white_within_groups(bands).sums_over_groups
-    well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.sizes) > 2.0
+    well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.band_sizes) > 2.0
     sums, Q = whole(sums), whole(Q)
     size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
     error = np.abs(sums - Q)[well] / np.where(size > 0.0, size, np.inf)[well]
@@ -229,7 +234,7 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
     state = RigidParameters(TRUTH, 1e-3, r, R)
     step = np.zeros(23)
     step[k] = 1e-5
-    ahead, behind = (_residual_and_derivative(_apply_step(state, x))[1] for x in (step, -step))
+    ahead, behind = (_residual_and_derivative(_add_rigid_step(state, x))[1] for x in (step, -step))
     derivative = (ahead - behind) / 2e-5
     np.testing.assert_allclose(_residual_and_derivative(state)[0][:, k], -derivative, atol=1e-6)
 
@@ -245,11 +250,11 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
 def test_load_delay_and_frame_are_within_their_deviations(kind):
     found = estimate(kind)
     assert np.abs(deviations(found)).max() < 3.5
-    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation_s)
+    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_std_s)
     assert found.fit.is_rigid and found.rejected.mean() < 0.03 and found.note == ""
     assert not found.frame.is_shifted and not found.frame.is_rotated
     assert found.frame.is_position_known.all() and found.frame.is_rotation_known.all()
-    assert np.abs(found.frame.p_SoPo_S / found.frame.position_deviations_m).max() < 4.0
+    assert np.abs(found.frame.p_SoPo_S / found.frame.position_stds_m).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) < 1e-3
 
 
@@ -258,11 +263,11 @@ def test_wrong_pose_frame_is_detected_and_estimated():
     found = estimate(kind)
     frame = found.frame
     assert frame.is_shifted and frame.is_rotated
-    np.testing.assert_allclose(frame.p_SoPo_S, SHIFT, atol=5 * frame.position_deviations_m.max())
-    assert frame.position_deviations_m.max() < 5e-4
+    np.testing.assert_allclose(frame.p_SoPo_S, SHIFT, atol=5 * frame.position_stds_m.max())
+    assert frame.position_stds_m.max() < 5e-4
     turn = np.degrees(np.arccos((np.trace(frame.R_SP.T @ TURN) - 1) / 2))
-    assert turn < 5 * frame.rotation_deviations_deg.max() < 0.2
-    assert not found.fit.is_rigid and found.fit.deviation_inflation > 5.0
+    assert turn < 5 * frame.rotation_stds_deg.max() < 0.2
+    assert not found.fit.is_rigid and found.fit.std_inflation_by_misfit > 5.0
 
 
 def test_deviations_of_the_frame_match_the_scatter():
@@ -271,13 +276,11 @@ def test_deviations_of_the_frame_match_the_scatter():
     for k in range(6):
         step = np.zeros(23)
         step[17 + k] = 1e-6
-        states = [_apply_step(found.free_frame_fit.state, x) for x in (step, -step)]
+        states = [_add_rigid_step(found.free_frame_fit.parameters, x) for x in (step, -step)]
         ahead, behind = (-state.R_PS.T @ state.p_PoSo_P for state in states)
         place[:, k] = (ahead - behind) / 2e-6
     covariance = place @ found.free_frame_fit.covariance[17:, 17:] @ place.T
-    np.testing.assert_allclose(
-        found.frame.position_deviations_m, np.sqrt(np.diag(covariance)), rtol=1e-5
-    )
+    np.testing.assert_allclose(found.frame.position_stds_m, np.sqrt(np.diag(covariance)), rtol=1e-5)
 
 
 def test_noise_of_poses_does_not_bias_the_load():
@@ -299,9 +302,11 @@ def test_noise_of_poses_does_not_bias_the_load():
             noise,
             NoiseLevels.white_within_groups(spectra.bands),
             free,
-            spectra.fit_coefficients().power,
+            spectra.fit_coefficients().noise_power,
         )
-        inertias.append(_solve_rigid_fit(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
+        inertias.append(
+            _solve_rigid_fit(record_, start).parameters.theta[[10, 13]] / PHI[[4, 7]] - 1.0
+        )
     compensated, plain = np.abs(inertias)
     assert (compensated < 0.5 * plain).all()
     assert (compensated < 0.02).all()
@@ -337,8 +342,8 @@ def test_load_is_estimated_with_40_percent_of_the_record_excluded():
     """Ten pieces of 0.8 s give twenty edges, which must not bias the delay."""
     t, wrench, poses = record(Kind(seed=13))
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W, lost=(t % 2.0) < 0.8)
-    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation_s)
-    assert found.delay_deviation_s < 3e-4
+    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_std_s)
+    assert found.delay_std_s < 3e-4
     assert found.fit.is_rigid and np.abs(deviations(found)).max() < 3.5
     assert np.sqrt(found.covariance[6, 6]) < 2e-3
 
@@ -385,7 +390,7 @@ def test_weights_recover_from_a_poor_start():
         spectra.fit_coefficients(),
     )
     assert fit.is_rigid
-    assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
+    assert np.abs(fit.parameters.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
 
 
 def test_coloured_noise_does_not_select_the_finest_knots():
@@ -407,13 +412,13 @@ def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> UnitsAnd
 def test_units_axes_and_sign_are_read_off():
     t, wrench, poses = record(Kind(seed=7))
     seen = figures_of(wrench, replace(poses, position=1000.0 * poses.position), t)
-    assert seen.position_unit_ratio == pytest.approx(1e-3, abs=5 * seen.position_unit_deviation)
-    assert seen.position_unit_deviation < 2e-5
-    np.testing.assert_allclose(seen.axis_masses_kg, 1.7, atol=5 * seen.max_mass_deviation_kg)
+    assert seen.position_unit_ratio == pytest.approx(1e-3, abs=5 * seen.position_unit_ratio_std)
+    assert seen.position_unit_ratio_std < 2e-5
+    np.testing.assert_allclose(seen.axis_masses_kg, 1.7, atol=5 * seen.max_mass_std_kg)
     seen = figures_of(wrench[:, [1, 0, 2, 4, 3, 5]], poses, t)
     assert seen.is_usable and seen.is_mirrored
     np.testing.assert_allclose(seen.R_SP, [[0, 1, 0], [1, 0, 0], [0, 0, 1]], atol=0.01)
-    assert seen.position_unit_ratio == pytest.approx(1.0, abs=5 * seen.position_unit_deviation)
+    assert seen.position_unit_ratio == pytest.approx(1.0, abs=5 * seen.position_unit_ratio_std)
     np.testing.assert_allclose(figures_of(-wrench, poses, t).R_SP, -np.eye(3), atol=0.01)
 
 
@@ -441,8 +446,8 @@ def test_gain_errors_cause_a_misfit_unless_they_are_stated():
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
     # Stated gain errors enter the deviations only once.
-    assert found.fit.is_explained_by_gains and found.fit.deviation_inflation == 1.0
-    assert replace(found.fit, misfit_of_gains=0.0).deviation_inflation > 3.0
+    assert found.fit.is_explained_by_gains and found.fit.std_inflation_by_misfit == 1.0
+    assert replace(found.fit, expected_misfit_by_gains=0.0).std_inflation_by_misfit > 3.0
 
 
 @pytest.mark.slow
@@ -468,7 +473,7 @@ def test_gain_effects_predict_the_change_of_the_estimate():
         np.ones(23, bool),
     )
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    power = spectra.fit_coefficients().power
+    power = spectra.fit_coefficients().noise_power
     solution = _solve_rigid_fit(_FitData(Z, none, levels, free, power), start)
     effects = _parameter_errors_of_unit_gains(solution, Z).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
@@ -476,9 +481,9 @@ def test_gain_effects_predict_the_change_of_the_estimate():
         A = np.eye(38)
         A[16 + d, 16 + k] += 1e-3 * UNITS[d, k]
         other = _solve_rigid_fit(
-            _FitData(A @ Z @ A.T, none, levels, free, power), solution.state
-        ).state
-        moved = 1e3 * (other.theta - solution.state.theta)
+            _FitData(A @ Z @ A.T, none, levels, free, power), solution.parameters
+        ).parameters
+        moved = 1e3 * (other.theta - solution.parameters.theta)
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
 
 
@@ -492,13 +497,13 @@ def test_wandering_channels_are_found_and_get_less_weight():
     splines = PoseSplines(poses.with_continuous_quaternions(), 0.1)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
     levels = fit_noise_levels(spectra.second_moments(), spectra.bands)
-    at = spectra.bands.sums_over_bands(spectra.bands.frequency) / spectra.bands.sizes
-    corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
+    at = spectra.bands.sums_over_bands(spectra.bands.frequency) / spectra.bands.band_sizes
+    corner = np.sqrt(levels.relative_power - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
-    power = fit_linear_model(spectra.second_moments(), levels).power
+    power = fit_linear_model(spectra.second_moments(), levels).noise_power
     assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
-    assert (np.diff(power[levels.group == 0, 2]) < 0.0).all()
+    assert (np.diff(power[levels.group_of_band == 0, 2]) < 0.0).all()
 
 
 def test_deviations_include_estimated_weights():
@@ -533,7 +538,7 @@ def test_clock_rate_of_the_poses_is_corrected():
 def test_given_delay_is_kept():
     found = estimate_from_poses(*record(Kind(seed=1)), GRAVITY_W, delay=LATE)
     assert found.delay_s == LATE
-    assert found.delay_deviation_s == 0.0
+    assert found.delay_std_s == 0.0
 
 
 def test_best_delay_is_found_from_a_distant_start():
@@ -543,7 +548,7 @@ def test_best_delay_is_found_from_a_distant_start():
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(
         PoseSplines(poses.with_continuous_quaternions(), 0.07), -0.05
     )
-    assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
+    assert find_best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
 @pytest.mark.parametrize("chopped", [False, True])

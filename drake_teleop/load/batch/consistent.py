@@ -17,7 +17,7 @@ _CONSTRAINT_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
 _PHI_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
 _MIN_LENGTH_UNIT_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
-_MIN_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
+_MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 
 
 def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
@@ -33,7 +33,7 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
     largest_diagonal = float((np.diag(gram)[6:] * unit**2).max())
-    if np.abs(reduced).max() <= _MIN_EIGENVALUE * largest_diagonal:
+    if np.abs(reduced).max() <= _MIN_KEPT_EIGENVALUE * largest_diagonal:
         return theta  # the record cannot separate load and offsets
     linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
     phi = unit * _solve_consistent_fit(0.5 * (reduced + reduced.T), linear)
@@ -91,5 +91,5 @@ def _distance_cone_coefficients(H: Array, b: Array) -> tuple[Array, Array]:
     root = np.sqrt(np.maximum(values, _RIDGE_EIGENVALUE))
     cone, constants = np.zeros((11, 11)), np.zeros(11)
     cone[0, 10], cone[1:, :10] = 1.0, root[:, None] * vectors.T
-    constants[1:] = -np.where(values > _MIN_EIGENVALUE, vectors.T @ b / root, 0.0) / scale
+    constants[1:] = -np.where(values > _MIN_KEPT_EIGENVALUE, vectors.T @ b / root, 0.0) / scale
     return cone, constants

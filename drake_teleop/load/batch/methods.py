@@ -28,7 +28,7 @@ from drake_teleop.load.batch.uncertainty import (
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
-    CHUNK_ROWS,
+    SAMPLES_PER_CHUNK,
     NoiseStd,
     SecondMoments,
     excited_columns,
@@ -39,16 +39,16 @@ from drake_teleop.load.moments import (
 from drake_teleop.load.normal_equations import NormalEquations
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
-_MIN_RELATIVE_NOISE = 1e-7
+_MIN_NOISE_OVER_RMS = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_WRENCH_NOISE_SHARE = 0.01
+_MIN_NOISE_OVER_RESIDUAL = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
-_HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
+_HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
 _STD_PER_NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
-_MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
+_MIN_SAMPLES_TO_REJECT, _MAX_HUBER_SAMPLES, _MAX_FIT_STD_GROWTH = 12, 50_000, 2.0
 _NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " are indistinguishable from motion errors (delay, scale, mounting): no sample was rejected"
@@ -78,13 +78,13 @@ def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorF
 
 
 def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_moments(
+    return _fit_to_moments(
         record.moments, replace(options, noise=NoiseStd(options.noise.wrench)), record
     )
 
 
 def _fit_total_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_moments(record.moments, options, record)
+    return _fit_to_moments(record.moments, options, record)
 
 
 def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -103,16 +103,16 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _fit_huber(record.decimate(max(1, n // _MAX_START_SAMPLES)), options)
+    form = _fit_huber(record.decimate(max(1, n // _MAX_HUBER_SAMPLES)), options)
     rejected = np.zeros(n, bool)
-    for _ in range(_MAX_FITS):
+    for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
-        rejected = _relative_residuals(record, form.theta, options.shared_noise) > _REJECTION_LIMIT
+        rejected = _residuals_over_std(record, form.theta, options.shared_noise) > _REJECTION_STDS
         moments = SecondMoments()
-        moments.add(*record.wrench_and_motion, weights=~rejected)
-        if _std_growth_by_rejection(whole, moments) > _MAX_STD_GROWTH:
+        moments.add_samples(*record.wrench_and_motion, weights=~rejected)
+        if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
             return replace(whole, note=_NOTHING_REJECTED_NOTE)
-        fit = _fit_moments(moments, options, record)
+        fit = _fit_to_moments(moments, options, record)
         form = fit.form
         if (rejected == previous).all():
             break
@@ -121,15 +121,15 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
 
 def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> NormalForm:
     moments, weights = record.moments, np.ones(len(record.s))
-    for _ in range(_MAX_FITS):
+    for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        form = _fit_moments(moments, options, record).form
-        distances = _relative_residuals(record, form.theta, options.shared_noise)
-        weights = np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
+        form = _fit_to_moments(moments, options, record).form
+        distances = _residuals_over_std(record, form.theta, options.shared_noise)
+        weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
         moments = SecondMoments()
-        moments.add(*record.wrench_and_motion, weights=weights)
+        moments.add_samples(*record.wrench_and_motion, weights=weights)
     return form
 
 
@@ -202,7 +202,7 @@ def identify_batch(
         np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
     )
     kept = ~fit.rejected
-    equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
+    equations.add_samples(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean_products
     walk = np.square(np.broadcast_to(options.noise.walk, 12))
@@ -228,7 +228,7 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _fit_moments(
+def _fit_to_moments(
     moments: SecondMoments, options: EstimatorOptions, record: SampleRecord
 ) -> EstimatorFit:
     noise, Z = options.noise, moments.mean_products
@@ -236,7 +236,7 @@ def _fit_moments(
         std = np.asarray(noise.wrench, np.float64)
     else:
         std = np.ones(6)
-        floor = _MIN_RELATIVE_NOISE * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = _MIN_NOISE_OVER_RMS * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
         floor = np.where(floor > 0.0, floor, 1.0)
         for known in (NoiseStd(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
@@ -248,23 +248,23 @@ def _fit_moments(
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
             std = np.sqrt(
-                np.maximum(squares - explained, _MIN_WRENCH_NOISE_SHARE * squares).clip(floor**2)
+                np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares).clip(floor**2)
             )
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _relative_residuals(record: SampleRecord, theta: Array, shared: bool) -> Array:
+def _residuals_over_std(record: SampleRecord, theta: Array, shared: bool) -> Array:
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)
     if shared:
         median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_STD_PER_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
+    scale = np.maximum(_STD_PER_NORMAL_MAD * median, _MIN_NOISE_OVER_RMS * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
-    for start in range(0, n, CHUNK_ROWS):
-        part = slice(start, start + CHUNK_ROWS)
+    for start in range(0, n, SAMPLES_PER_CHUNK):
+        part = slice(start, start + SAMPLES_PER_CHUNK)
         out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
     return out

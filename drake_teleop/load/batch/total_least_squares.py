@@ -26,7 +26,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 
 # Largest number of weight updates, relative change of theta at convergence, smallest relative
 # distance of a root from a pole, and standard deviations of noise that a signal must exceed.
-_MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _MIN_SIGNAL_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
+_MAX_REWEIGHTINGS, _THETA_TOLERANCE, _MIN_POLE_DISTANCE, _MIN_SIGNAL_STDS = 10, 1e-8, 1e-12, 5.0
 _MIN_WRENCH_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
@@ -36,17 +36,17 @@ class NormalForm(NamedTuple):
     Attributes:
         gram: (16, 16) Gram matrix per sample, compensated for noise.
         weights: (6, 6) weights between wrench channels.
-        scale: ratio of residual variance to specified noise variance.
-        map_from_ordinary_solution: (16, 16) matrix from ordinary least squares to theta.
+        noise_scale: ratio of residual variance to specified noise variance.
+        map_from_ordinary: (16, 16) matrix from ordinary least squares to theta.
     """
 
     gram: Array
     right: Array
     theta: Array
     weights: Array
-    scale: float
+    noise_scale: float
     map_from_ordinary: Array
-    undetermined: NDArray[np.bool_]
+    is_undetermined: NDArray[np.bool_]
 
 
 def total_least_squares(
@@ -64,9 +64,9 @@ def total_least_squares(
             remedy="check that the sensor is connected and that its orientation changes",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    excess = _MIN_SIGNAL_DEVIATIONS * np.sqrt(2.0 / moments.num_samples)
+    excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_REWEIGHTINGS):
         form = _solve_compensated_equations(Z, Q, W, offsets, min_gain)
         change = np.linalg.norm(form.theta - previous)
         if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
@@ -104,9 +104,9 @@ def _solve_compensated_equations(
         right=gram_basis @ (basis[:, kept].T @ right),
         theta=theta,
         weights=W,
-        scale=scale,
+        noise_scale=scale,
         map_from_ordinary=inverse @ gram,
-        undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
+        is_undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
     )
 
 
@@ -117,7 +117,7 @@ def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: fl
 
     highest = squares / noise
     if highest * nu[-1] >= 1.0:
-        highest = (1.0 - _POLE_DISTANCE) / nu[-1]
+        highest = (1.0 - _MIN_POLE_DISTANCE) / nu[-1]
     if determinant_condition(0.0) <= 0.0:  # no residual
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
@@ -154,7 +154,7 @@ class SampleRecord:
     @cached_property
     def moments(self) -> SecondMoments:
         moments = SecondMoments()
-        moments.add(*self.wrench_and_motion)
+        moments.add_samples(*self.wrench_and_motion)
         return moments
 
     def decimate(self, step: int) -> SampleRecord:

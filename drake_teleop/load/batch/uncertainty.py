@@ -13,13 +13,13 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.total_least_squares import EstimatorFit, NormalForm, SampleRecord
 from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_DEVIATION,
+    MAX_IDENTIFIED_STD_SHARE,
     PARAMETER_NAMES,
     Identification,
     natural_scales,
 )
 from drake_teleop.load.moments import (
-    CHUNK_ROWS,
+    SAMPLES_PER_CHUNK,
     excited_columns,
     normal_equations,
     regressor_coefficients,
@@ -35,9 +35,9 @@ CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 _PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
-_MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
+_MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_COMBINATION_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
-_MIN_NUMBERED_TERM_SHARE, _MIN_ELLIPSIS_TERM_SHARE = 0.1, 0.01
+_MIN_TERM_SHARE_WITH_NUMBER, _MIN_TERM_SHARE_AS_ELLIPSIS = 0.1, 0.01
 
 
 def confidence_intervals(load: Identification) -> tuple[Array, Array]:
@@ -65,20 +65,20 @@ class Combination:
 
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
-        leading: index of the leading parameter in `PARAMETER_NAMES`.
-        relative_deviation: standard deviation relative to the natural scale of the combination.
+        leading_index: index of the leading parameter in `PARAMETER_NAMES`.
+        relative_std: standard deviation relative to the natural scale of the combination.
         text: the sum in words.
     """
 
     coefficients: Array
-    leading: int
+    leading_index: int
     value: float
     standard_deviation: float
     relative_std: float
     text: str
 
     def __str__(self) -> str:
-        unit = _PARAMETER_UNITS[self.leading]
+        unit = _PARAMETER_UNITS[self.leading_index]
         return f"{self.text} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
@@ -110,7 +110,7 @@ class BaseParameters:
             f"only together: {c}" for c in self.combinations if np.count_nonzero(c.coefficients) > 1
         ]
         for c in self.weak_directions:
-            if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_DEVIATION:
+            if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_STD_SHARE:
                 percentage = (
                     f"{100.0 * c.relative_std:.0f} % of" if c.relative_std < 1.0 else "more than"
                 )
@@ -142,11 +142,11 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     norm = np.sqrt(np.where(unexcited, 1.0, np.diag(gram)))
     scale = np.where(unexcited, 0.0, np.repeat([1.0, 2.0], [6, 10]) / norm)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+    kept = eigenvalues > _MIN_RELATIVE_GRAM_EIGENVALUE * eigenvalues[-1]
     rank = int(kept.sum())
     R, order = qr(np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T, mode="r", pivoting=True)
     dependence = solve_triangular(R[:, :rank], R[:, rank:])
-    dependence[np.abs(dependence) < _MIN_COEFFICIENT] = 0.0
+    dependence[np.abs(dependence) < _MIN_COMBINATION_COEFFICIENT] = 0.0
     combinations = []
     for row, i in enumerate(order[:rank]):
         c = np.zeros(16)
@@ -156,7 +156,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
             if dependence[row, column] != 0.0:
                 c[j] = dependence[row, column] * scale[i] / scale[j]
         combinations.append(scaled_combination(c, int(i)))
-    combinations.sort(key=lambda c: c.leading)
+    combinations.sort(key=lambda c: c.leading_index)
 
     # Principal directions of determined but not identified parameters.
     weak = np.flatnonzero(~load.identifiable & np.isfinite(load.standard_deviations))
@@ -174,16 +174,16 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
 def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = PARAMETER_NAMES[leading]
-    for i in np.flatnonzero(weights >= _MIN_NUMBERED_TERM_SHARE):
+    for i in np.flatnonzero(weights >= _MIN_TERM_SHARE_WITH_NUMBER):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETER_NAMES[i]}"
-    small = (weights < _MIN_NUMBERED_TERM_SHARE) & (weights >= _MIN_ELLIPSIS_TERM_SHARE)
+    small = (weights < _MIN_TERM_SHARE_WITH_NUMBER) & (weights >= _MIN_TERM_SHARE_AS_ELLIPSIS)
     return text + " + ..." if small.any() else text
 
 
-TORQUE_ARM_M = 0.06
+GAIN_ERROR_TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
@@ -223,8 +223,8 @@ def covariance_for_random_walks(
         return covariance
     backwards, used = record.decimate(-1), kept[::-1]
     after = np.zeros((6, 16))
-    for start in range(0, len(used), CHUNK_ROWS):
-        part = slice(start, start + CHUNK_ROWS)
+    for start in range(0, len(used), SAMPLES_PER_CHUNK):
+        part = slice(start, start + SAMPLES_PER_CHUNK)
         rows = np.zeros((len(used[part]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
         rows[:, :, 6:] = regressor(*(table[part] for table in backwards.wrench_and_motion[1:]))
@@ -244,7 +244,7 @@ def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Arra
     the Gram matrix.
     """
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
-    length = np.repeat([1.0, TORQUE_ARM_M], 3)
+    length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(len(inverse), 36))
 
@@ -270,7 +270,7 @@ def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Arr
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
     covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
-    unknown = unknown | form.undetermined
+    unknown = unknown | form.is_undetermined
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     return covariance

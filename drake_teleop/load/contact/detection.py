@@ -36,11 +36,11 @@ from drake_teleop.load.contact.noise_floor import (
 # below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
 # sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
 SAMPLE_COUNT_INDEX, FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 0, 3, 4, 5
-NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START = 8, 14, 20
-TOTAL_SUM_START, RING_BUFFER_START = 26, 32
+NORMALIZED_WRENCH_START, MEAN_START, CUSUM_START = 8, 14, 20
+INNOVATION_SUM_START, RING_BUFFER_START = 26, 32
 MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
 """Length of the memory of `update_statistics`."""
-DEFAULT_SLACK = 1.0
+CUSUM_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
 shift to be detected is best; this value tolerates lasting errors of the load."""
 MAX_NOISE_LEVEL = 6.2
@@ -82,16 +82,16 @@ def update_statistics(
         )
         memory[NORMALIZED_WRENCH_START + i] = z
         level += z * z
-        memory[CUMULATIVE_SUM_START + i] += e
-        length += memory[CUMULATIVE_SUM_START + i] * memory[CUMULATIVE_SUM_START + i]
-        memory[TOTAL_SUM_START + i] += e
+        memory[CUSUM_START + i] += e
+        length += memory[CUSUM_START + i] * memory[CUSUM_START + i]
+        memory[INNOVATION_SUM_START + i] += e
     level, length = math.sqrt(level), math.sqrt(length)
     if level < quiet:
         for c in range(6):
             memory[MEAN_START + c] += following * (contact[c] - memory[MEAN_START + c])
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
-        memory[CUMULATIVE_SUM_START + i] *= shrink
+        memory[CUSUM_START + i] *= shrink
     # The sum before the first sample is zero, as is the initial ring.
     here = RING_BUFFER_START + 6 * (count % MAX_SUMMED_SAMPLES)
     best, n = 0.0, 1
@@ -101,12 +101,12 @@ def update_statistics(
         before = RING_BUFFER_START + 6 * ((count + MAX_SUMMED_SAMPLES - n) % MAX_SUMMED_SAMPLES)
         total = 0.0
         for i in range(6):
-            difference = memory[TOTAL_SUM_START + i] - memory[before + i]
+            difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
             total += difference * difference
         best = max(best, total / (n * widths[m] * widths[m]))
         n *= 2
     for i in range(6):
-        memory[here + i] = memory[TOTAL_SUM_START + i]
+        memory[here + i] = memory[INNOVATION_SUM_START + i]
     memory[SAMPLE_COUNT_INDEX] += 1.0
     memory[STATISTICS_START] = level
     memory[STATISTICS_START + 1] = length * shrink
@@ -123,9 +123,7 @@ def _statistics_of_rows(rows, parameters, slack, following, quiet, out):
         out[k] = memory[STATISTICS_START : STATISTICS_START + 3]
 
 
-def statistics_of_log(
-    floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK
-) -> Array:
+def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUSUM_SLACK) -> Array:
     """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
     rows = validate_detector_samples(*samples)
     out = np.empty((len(rows[0]), 3))
@@ -145,7 +143,7 @@ def _sum_of_last_innovations(memory, hold, widths):
     )
     total = 0.0
     for i in range(6):
-        difference = memory[TOTAL_SUM_START + i] - memory[before + i]
+        difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
         total += difference * difference
     return math.sqrt(total / (1 << m)) / widths[m]
 
@@ -166,7 +164,7 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
         ):
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG_INDEX] = 0.0
-            memory[CUMULATIVE_SUM_START:] = 0.0
+            memory[CUSUM_START:] = 0.0
             memory[SAMPLE_COUNT_INDEX] = 1.0
     return memory[FLAG_INDEX] != 0.0
 
@@ -217,7 +215,7 @@ class ContactDetector:
                 where="following",
                 remedy="give 0 to subtract no mean",
             )
-        decision = DEFAULT_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
+        decision = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
         self.settings = (floor.compiled_parameters, decision)
         self._memory = self.initial_memory()
@@ -250,9 +248,9 @@ def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
-_MIN_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
-_MAX_FITS, _FIT_TOLERANCE = 20, 1e-4
-_MAX_LAG_ONE_CORRELATION, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
+_MIN_WRENCH_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
+_MAX_VARIANCE_FITS, _VARIANCE_FIT_TOLERANCE = 20, 1e-4
+_MAX_LAG_ONE_CORRELATION, _MIN_SUM_WIDTH, _RARE_SUM_SHARE = 0.999, 0.1, 1e-3
 
 
 def fit_noise_floor(
@@ -285,15 +283,15 @@ def fit_noise_floor(
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
-        variance = np.full(len(square), max(float(square.mean()), _MIN_NOISE_STD[c] ** 2))
-        for _ in range(_MAX_FITS):
+        variance = np.full(len(square), max(float(square.mean()), _MIN_WRENCH_NOISE_STD[c] ** 2))
+        for _ in range(_MAX_VARIANCE_FITS):
             previous = fitted[c].copy()
             weighted = np.column_stack([terms, square - explained]) / variance[:, None]
             R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             fitted[c] = nnls(R[:, :3], R[:, 3])[0]
-            fitted[c, 0] = max(fitted[c, 0], _MIN_NOISE_STD[c] ** 2)
+            fitted[c, 0] = max(fitted[c, 0], _MIN_WRENCH_NOISE_STD[c] ** 2)
             variance = terms @ fitted[c] + explained
-            if np.allclose(fitted[c], previous, rtol=_FIT_TOLERANCE, atol=0.0):
+            if np.allclose(fitted[c], previous, rtol=_VARIANCE_FIT_TOLERANCE, atol=0.0):
                 break
     floor = NoiseFloor(
         np.sqrt(fitted[:, 0]), P, np.sqrt(fitted[:, 1:]), np.eye(6), np.zeros(6), fade=fade
@@ -313,9 +311,9 @@ def fit_noise_floor(
     lengths = [min(2**m, len(e)) for m in range(NUM_SUM_LENGTHS)]
     squares = [np.sum((sums[n:] - sums[:-n]) ** 2, axis=1) / n for n in lengths]
     power = np.array([square.mean() for square in squares]) / 6.0
-    rare = np.array([np.quantile(square, 1.0 - _RARE_SHARE) for square in squares])
+    rare = np.array([np.quantile(square, 1.0 - _RARE_SUM_SHARE) for square in squares])
     # A short record has few long sums: their quantile can be small by chance, their power is not.
     rare /= max(rare[0], 1e-12)
-    widths = np.sqrt(np.maximum(np.maximum(power, rare), _MIN_WIDTH**2))
-    floor = replace(floor, correlation=correlation, rho=rho, widths=widths)
-    return replace(floor, reached=statistics_of_log(floor, *rows).max(axis=0))
+    widths = np.sqrt(np.maximum(np.maximum(power, rare), _MIN_SUM_WIDTH**2))
+    floor = replace(floor, correlation=correlation, rho=rho, sum_widths=widths)
+    return replace(floor, free_maxima=statistics_of_log(floor, *rows).max(axis=0))

@@ -32,7 +32,7 @@ HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
-THRESHOLD_MARGIN = 1.25
+THRESHOLD_OVER_MAX = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
 
@@ -76,9 +76,9 @@ class NoiseFloor:
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
         correlation: (6, 6) correlation between channels.
         rho: (6,) lag-one correlation of the normalised wrench.
-        widths: (8,) standard deviations of sums of 1, 2, 4 ... innovations over sqrt(number).
+        sum_widths: (8,) standard deviations of sums of 1, 2, 4 ... innovations over sqrt(number).
         fade: factor per sample of the held acceleration peaks; 0: peaks are not held.
-        reached: (3,) largest value of each statistic in the fitted motion.
+        free_maxima: (3,) largest value of each statistic in the fitted motion.
     """
 
     noise: Array
@@ -86,9 +86,9 @@ class NoiseFloor:
     per_acceleration: Array
     correlation: Array
     rho: Array
-    widths: Array = field(default_factory=lambda: np.ones(NUM_SUM_LENGTHS))
+    sum_widths: Array = field(default_factory=lambda: np.ones(NUM_SUM_LENGTHS))
     fade: float = 0.0
-    reached: Array = field(default_factory=lambda: np.zeros(3))
+    free_maxima: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         positive_array("noise", self.noise, 6)
@@ -102,8 +102,8 @@ class NoiseFloor:
                 where="rho",
                 remedy="call fit_noise_floor",
             )
-        positive_array("widths", self.widths, NUM_SUM_LENGTHS)
-        finite_array("reached", self.reached, 3)
+        positive_array("sum_widths", self.sum_widths, NUM_SUM_LENGTHS)
+        finite_array("free_maxima", self.free_maxima, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(
                 f"{self.fade} is outside the range 0 <= fade < 1",
@@ -117,10 +117,10 @@ class NoiseFloor:
                 remedy="call fit_noise_floor",
             )
 
-    def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:
+    def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
         return margin * float(
-            positive_array("reached", self.reached, 3)[statistic_index(statistic)]
+            positive_array("free_maxima", self.free_maxima, 3)[statistic_index(statistic)]
         )
 
     @property
@@ -128,7 +128,7 @@ class NoiseFloor:
         """Arguments of compiled functions: n^2, P, [k^2 l^2], whitening, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
-        return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
+        return variances, self.covariance, growth, root, self.rho, self.sum_widths, self.fade
 
     def noise_std_along(self, *motion: ArrayLike) -> Array:
         """Return the noise sigma (N, 6) [N, N m] along a free motion."""

@@ -37,11 +37,11 @@ STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
 STATE_KNOWN, STATE_DISTURBED, STATE_CHANGED, STATE_IDENTIFIED = range(4)
 
-BLOCK_DURATION_S, ESTIMATE_WINDOW_S = 0.016, 2.0
-MIN_NEW_LOAD_AGE_S, MODEL_ERROR_DURATION_S = 0.2, 0.3
+DETECTOR_BLOCK_DURATION_S, FILTER_RESTART_INTERVAL_S = 0.016, 2.0
+MIN_NEW_LOAD_AGE_S, MODEL_ERROR_PERSISTENCE_S = 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
-MAX_RELATIVE_MASS_STD = 0.0025
+MAX_MASS_STD_OVER_CHANGE = 0.0025
 """Default of `bound`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT_STD = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
@@ -53,9 +53,9 @@ OBJECT_PRIOR_STD = PRIOR_STD[6:]
 # blocks of noise reach the return limit.
 _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
-_FIRST_MOMENT_BOUND_FACTOR, _MIN_SIZE_M = 10.0, 0.03
+_FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_MAX_NEGATIVE_DEVIATIONS = 4.0
+_MAX_NEGATIVE_MASS_OVER_STD = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -71,7 +71,7 @@ _MAX_NEGATIVE_DEVIATIONS = 4.0
     _IDENTIFIED_SAMPLES_INDEX,
     _ALPHA_SQUARES_INDEX,
 ) = range(10)
-_KNOWN_SQUARES_START, _NEW_SQUARES_START, _WRENCH_SUM_START = 10, 16, 22
+_KNOWN_RESIDUAL_SQUARES_START, _NEW_RESIDUAL_SQUARES_START, _WRENCH_SUM_START = 10, 16, 22
 _MOTION_SUM_START, _REGRESSOR_SUM_START, _KNOWN_LOAD_START = 28, 37, 97
 _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_START + 544
 
@@ -79,7 +79,7 @@ MEMORY_SIZE = _KNOWN_LOAD_START + 816
 """Length of the memory of `update_change_detector`."""
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
-_MIN_RELATIVE_VARIANCE = 1e-10
+_MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 
 
 @njit(cache=True)
@@ -138,7 +138,7 @@ def update_estimate(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _MIN_RELATIVE_VARIANCE * uncorrelated) + predicted
+        total = max(1.0, _MIN_ROW_VARIANCE_OVER_TERMS * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total
@@ -170,7 +170,7 @@ def _restart_filter(memory, place):
         for j in range(10):
             memory[place + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
         memory[_NEW_LOAD_START_INDEX] = memory[_SAMPLE_COUNT_INDEX]
-        memory[_NEW_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
+        memory[_NEW_RESIDUAL_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
     memory[_CUSUM_INDEX] = memory[_ESTIMATE_AGE_INDEX] = 0.0
 
 
@@ -180,7 +180,7 @@ def _is_identified(memory, bound):
     P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
-    moment = bound * change * max(size, _MIN_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
+    moment = bound * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
     return math.sqrt(P[6, 6]) <= bound * change and math.sqrt(largest) <= moment
 
@@ -215,13 +215,13 @@ def update_change_detector(memory, sample, block, noise, window, hold, bound):
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
     if memory[_BLOCK_SAMPLES_INDEX] >= block:
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] /= block
-        _test_block(memory, block, noise, window, hold, bound)
+        _test_block_for_change(memory, block, noise, window, hold, bound)
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] = 0.0
         memory[_BLOCK_SAMPLES_INDEX] = 0.0
 
 
 @njit(cache=True)
-def _test_block(memory, block, noise, window, hold, bound):
+def _test_block_for_change(memory, block, noise, window, hold, bound):
     if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]:
         if memory[_ESTIMATE_AGE_INDEX] >= window:
             excess = memory[_CUSUM_INDEX]
@@ -253,12 +253,12 @@ def _test_block(memory, block, noise, window, hold, bound):
             residual -= (
                 memory[_REGRESSOR_SUM_START + 10 * c + j] * memory[_NEW_FILTER_START + 6 + j]
             )
-        memory[_NEW_SQUARES_START + c] += residual * residual
+        memory[_NEW_RESIDUAL_SQUARES_START + c] += residual * residual
     memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     # A clearly negative mass is not a load.
     mass = memory[_NEW_FILTER_START + 6]
     deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
-    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
+    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_MASS_OVER_STD * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_filter(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
@@ -268,15 +268,15 @@ def _test_block(memory, block, noise, window, hold, bound):
         _inflate_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
         memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
-        for i in range(_NEW_SQUARES_START - _KNOWN_SQUARES_START):
-            memory[_KNOWN_SQUARES_START + i] = memory[_NEW_SQUARES_START + i] * (
+        for i in range(_NEW_RESIDUAL_SQUARES_START - _KNOWN_RESIDUAL_SQUARES_START):
+            memory[_KNOWN_RESIDUAL_SQUARES_START + i] = memory[_NEW_RESIDUAL_SQUARES_START + i] * (
                 block / memory[_ESTIMATE_AGE_INDEX]
             )
         _restart_filter(memory, _MONITOR_FILTER_START)
 
 
 @njit(cache=True)
-def _process_samples(memory, samples, states, block, noise, window, hold, bound):
+def _process_samples_of_log(memory, samples, states, block, noise, window, hold, bound):
     for k in range(samples.shape[0]):
         update_change_detector(memory, samples[k], block, noise, window, hold, bound)
         states[k] = int(memory[_STATE_INDEX])
@@ -309,14 +309,14 @@ def change_detector_parameters(
             remedy="give the relative error of the model",
         )
     bound = (
-        max(MAX_RELATIVE_MASS_STD, 2.0 * model_error)
+        max(MAX_MASS_STD_OVER_CHANGE, 2.0 * model_error)
         if bound is None
         else float(positive_array("bound", bound))
     )
-    block = max(1, round(BLOCK_DURATION_S / period))
+    block = max(1, round(DETECTOR_BLOCK_DURATION_S / period))
     window, hold, memory = (
         max(1, round(x / (block * period)))
-        for x in (ESTIMATE_WINDOW_S, MIN_NEW_LOAD_AGE_S, MODEL_ERROR_DURATION_S)
+        for x in (FILTER_RESTART_INTERVAL_S, MIN_NEW_LOAD_AGE_S, MODEL_ERROR_PERSISTENCE_S)
     )
     std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
@@ -384,7 +384,7 @@ def detector_states_of_log(
     """Return the detector's states (N,) for N samples of a log, as indices into `STATE_NAMES`."""
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
-    _process_samples(memory, np.concatenate(rows, axis=1), states, *parameters)
+    _process_samples_of_log(memory, np.concatenate(rows, axis=1), states, *parameters)
     return states
 
 
@@ -401,7 +401,7 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
         offsets=memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 6].copy(),
         covariance=covariance,
         identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
-        residual_rms=np.sqrt(memory[_KNOWN_SQUARES_START:_NEW_SQUARES_START]),
+        residual_rms=np.sqrt(memory[_KNOWN_RESIDUAL_SQUARES_START:_NEW_RESIDUAL_SQUARES_START]),
         method="recursive least squares",
         samples=int(memory[_IDENTIFIED_SAMPLES_INDEX]),
         degrees_of_freedom=np.full(16, np.inf),

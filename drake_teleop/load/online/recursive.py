@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import is_prior_dominated
 from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_DEVIATION,
+    MAX_IDENTIFIED_STD_SHARE,
     Identification,
     is_precise_enough,
 )
@@ -29,14 +29,14 @@ from drake_teleop.load.regressor import (
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
 
-MAX_SETTLED_STD = 0.05
+MAX_SETTLED_RELATIVE_STD = 0.05
 """Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
-_MIN_RELATIVE_EIGENVALUE = 1e-16
+_MIN_RELATIVE_INFORMATION_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
-_MIN_RELATIVE_VARIANCE = 1e-10
+_MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 
 
 @njit(cache=True)
@@ -78,7 +78,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
                 innovation -= v * theta[6 + j]
                 predicted += v * gain[6 + j]
                 uncorrelated += v * v * P[6 + j, 6 + j]
-            variance = max(noise_std[c] * noise_std[c], _MIN_RELATIVE_VARIANCE * uncorrelated)
+            variance = max(noise_std[c] * noise_std[c], _MIN_ROW_VARIANCE_OVER_TERMS * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
             squares[c] += variance * innovation * share
@@ -111,7 +111,7 @@ class RecursiveEstimator(ABC):
         noise_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = MAX_SETTLED_STD,
+        bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(
@@ -214,7 +214,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_DEVIATION),
+            identifiable=self._are_certain(deviations, self._theta, MAX_IDENTIFIED_STD_SHARE),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -226,14 +226,14 @@ class RecursiveEstimator(ABC):
     def _are_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return certain & is_precise_enough(
-            deviations * (MAX_IDENTIFIED_DEVIATION / bound), theta[6:]
+            deviations * (MAX_IDENTIFIED_STD_SHARE / bound), theta[6:]
         )
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)
         scale = 1.0 / np.sqrt(np.diag(information))
         eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
-        smallest = max(eigenvalues[0], _MIN_RELATIVE_EIGENVALUE * eigenvalues[-1])
+        smallest = max(eigenvalues[0], _MIN_RELATIVE_INFORMATION_EIGENVALUE * eigenvalues[-1])
         return float(np.sqrt(eigenvalues[-1] / smallest))
 
 

@@ -21,7 +21,7 @@ from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.moments import regressor_coefficients
 from drake_teleop.load.online.recursive import (
-    MAX_SETTLED_STD,
+    MAX_SETTLED_RELATIVE_STD,
     PRIOR_STD,
     RecursiveEstimator,
     RecursiveLeastSquares,
@@ -31,14 +31,14 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 # Relative increase of diagonal elements against rounding.
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
-_WRENCH_START, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
 _MIN_RELATIVE_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
-_MIN_SCALE_SAMPLES = 20
+_MIN_SAMPLES_FOR_NOISE_SCALE = 20
 
 
 @cache
@@ -73,7 +73,7 @@ def write_products_vector(wrench, motion, z):
         for j in range(i + 1):
             z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
     for c in range(6):
-        z[_WRENCH_START + c] = wrench[c]
+        z[_WRENCH_START_IN_Z + c] = wrench[c]
 
 
 @njit(cache=True)
@@ -100,7 +100,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
-        L[c, _WRENCH_START + c] = 1.0
+        L[c, _WRENCH_START_IN_Z + c] = 1.0
     for t in range(len(factors)):
         L[index[t, 0], index[t, 1]] -= factors[t] * theta[index[t, 2]]
     for c in range(6):
@@ -122,7 +122,7 @@ def noise_products(Z, noise_std, motion_std, Q):
     """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
     Q[:] = 0.0
     for c in range(6):
-        Q[_WRENCH_START + c, _WRENCH_START + c] = Z[0, 0] * noise_std[c] ** 2
+        Q[_WRENCH_START_IN_Z + c, _WRENCH_START_IN_Z + c] = Z[0, 0] * noise_std[c] ** 2
     for k in range(3):
         Q[1 + k, 1 + k] = Z[0, 0] * motion_std[k] ** 2
         Q[4 + k, 4 + k] = Z[0, 0] * motion_std[6 + k] ** 2
@@ -223,7 +223,7 @@ class MomentEstimator(RecursiveEstimator):
         residual_products(self._memory[:19], self._theta, *nonzero_regressor_terms(), L, LZ, S)
         return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
 
-    def _limit_to_prior(self, covariance: Array) -> Array:
+    def _limit_variances_to_prior(self, covariance: Array) -> Array:
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
         return np.asarray(covariance * np.outer(shrink, shrink))
 
@@ -330,7 +330,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         motion_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = MAX_SETTLED_STD,
+        bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         self._motion_std = finite_array("motion_std", motion_std, 9)
         if (self._motion_std < 0.0).any():
@@ -367,7 +367,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        return self._limit_to_prior(factor @ factor.T + unknown @ unknown.T)
+        return self._limit_variances_to_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
@@ -381,7 +381,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
             Q,
         )
         scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
-        return G[:, :16], N, scale if memory[0, 0] > _MIN_SCALE_SAMPLES else 1.0
+        return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
 
     def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)

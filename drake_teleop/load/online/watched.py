@@ -36,7 +36,7 @@ LOAD_STATE_NAMES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
 STATE_LEARNING, STATE_SETTLED, STATE_DISTURBED, STATE_OTHER_LOAD = range(4)
 
-FADE_TIME_S, MIN_REST_S, OFFSET_TIME_S, MIN_EXPLAINED_S = 0.1, 0.3, 3.0, 0.1
+LOAD_FADE_TIME_S, MIN_OFFSET_REST_S, OFFSET_TRACKING_S, MIN_EXPLAINED_CHANGE_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
 MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
@@ -48,7 +48,7 @@ MAX_COM_DISTANCE_M = 1.0
 
 # Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
 # force [m/s^2] at rest.
-_LOW_PASS_TIME_CONSTANT_S, _MAX_REST_RATE, _MAX_REST_CHANGE = 0.05, 0.02, 0.1
+_LOW_PASS_TIME_CONSTANT_S, _MAX_REST_ANGULAR_SPEED, _MAX_REST_ACCELERATION_CHANGE = 0.05, 0.02, 0.1
 
 # Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
 # force, angular velocity and residual; specific force at the start of the rest; smallest and
@@ -83,11 +83,11 @@ def _is_at_rest(memory, sample, period):
         memory[_OMEGA_START + i] += share * (omega[i] - memory[_OMEGA_START + i])
         shift += (memory[_SPECIFIC_FORCE_START + i] - memory[_REST_FORCE_START + i]) ** 2
         rate += memory[_OMEGA_START + i] ** 2
-    if shift > _MAX_REST_CHANGE**2 or rate > _MAX_REST_RATE**2:
+    if shift > _MAX_REST_ACCELERATION_CHANGE**2 or rate > _MAX_REST_ANGULAR_SPEED**2:
         memory[_REST_SAMPLES_INDEX] = 0.0
         copy_into(memory, _REST_FORCE_START, memory, _SPECIFIC_FORCE_START, 3)
     memory[_REST_SAMPLES_INDEX] += 1.0
-    return memory[_REST_SAMPLES_INDEX] * period > MIN_REST_S
+    return memory[_REST_SAMPLES_INDEX] * period > MIN_OFFSET_REST_S
 
 
 @njit(cache=True)
@@ -105,7 +105,7 @@ def _force_has_changed(memory, residual, age, period):
     copy_into(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
     memory[_CHANGED_SAMPLES_INDEX] = memory[_CHANGED_SAMPLES_INDEX] + 1.0 if differs else 0.0
-    return memory[_CHANGED_SAMPLES_INDEX] * period > MIN_EXPLAINED_S
+    return memory[_CHANGED_SAMPLES_INDEX] * period > MIN_EXPLAINED_CHANGE_S
 
 
 @njit(cache=True)
@@ -140,7 +140,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
             and (np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6]) <= MAX_OFFSET_RESIDUAL).all()
         ):
             for i in range(6):
-                known[i] += period / OFFSET_TIME_S * residual[i]
+                known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
         other = (
             verdict == STATE_CHANGED
@@ -151,4 +151,4 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     copy_into(target, 0, known, 0, 16)
     if memory[_STATE_INDEX] == STATE_OTHER_LOAD:
         copy_into(target, 6, fallback, 0, 10)
-    out += period / (FADE_TIME_S + period) * (target - out)
+    out += period / (LOAD_FADE_TIME_S + period) * (target - out)

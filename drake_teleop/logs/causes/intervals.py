@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
+from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
 from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS, white_noise_deviations
@@ -80,7 +80,7 @@ def load_covariance_by_gain_errors(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
     weights = rows.whitened_products(fit.noise_filters) / fit.noise_power[:, None, None]
-    unit = np.repeat([1.0, TORQUE_ARM_M], 3)
+    unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (
         rows.columns == np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)[:, None]

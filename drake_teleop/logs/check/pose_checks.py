@@ -144,7 +144,7 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
     seen = found.units_and_axes
     if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
         unit = _position_unit_finding(
-            pose.position.unit, seen.position_unit_ratio, seen.position_unit_deviation
+            pose.position.unit, seen.position_unit_ratio, seen.position_unit_ratio_std
         )
         if unit is not None:
             return unit
@@ -153,11 +153,11 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
     """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
-    frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.state.theta[6:]
+    frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.parameters.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
     unit = abs(seen.position_unit_ratio - 1.0) > max(
-        _MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_deviation
+        _MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_ratio_std
     )
     if (
         unit
@@ -169,14 +169,14 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     texts, lines = [], []
     if frame.is_shifted:
         shift = ", ".join(f"{1e3 * x:.1f}" for x in frame.p_SoPo_S)
-        deviation = 1e3 * float(frame.position_deviations_m.max())
+        deviation = 1e3 * float(frame.position_stds_m.max())
         texts.append(
             f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
         )
         lines.append(f"pose.position_in_sensor: {round_for_yaml(place)}")
     if frame.is_rotated:
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
-        deviation = float(frame.rotation_deviations_deg.max())
+        deviation = float(frame.rotation_stds_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
     return Finding(

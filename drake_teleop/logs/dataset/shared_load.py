@@ -96,7 +96,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
-    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.reached[0]))
+    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.free_maxima[0]))
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 

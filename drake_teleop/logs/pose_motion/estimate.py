@@ -13,12 +13,12 @@ from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import (
-    DELAY_SEARCH_RANGE_S,
+    DELAY_SEARCH_HALF_RANGE_S,
     FitWindow,
     Spectra,
     choose_knot_spacing,
     correct_clock_rate,
-    delay_deviation,
+    delay_std,
     estimate_clock_rate_error,
     fit_linear_model,
     fit_noise_levels,
@@ -29,7 +29,7 @@ from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER_PARAMETERS,
-    NUM_PARAMETERS,
+    NUM_RIGID_PARAMETERS,
     OFFSET_AND_LOAD_PARAMETERS,
     ROTATION_PARAMETERS,
     RigidFit,
@@ -47,18 +47,18 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-MOTION_SEARCH_DURATION_S = 120.0
+SEARCHED_RECORD_PART_S = 120.0
 """Length of the searched part of a record [s]."""
-MIN_REPORTED_SHIFT_M, MAX_KNOWN_SHIFT_STD_M = 0.01, 0.02
+MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
-MIN_REPORTED_ROTATION_DEG, MAX_KNOWN_ROTATION_STD_DEG = 5.0, 1.0
+MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG = 5.0, 1.0
 """Least rotation that is reported, and largest standard deviation of a known one [deg]."""
-_MIN_WALD_STATISTIC, _MIN_SIGNIFICANT_DEVIATIONS = 50.0, 5.0
-_MAX_FREQUENCY_OVER_RATE = 0.45
+_MIN_FRAME_CHANGE_WALD_STATISTIC, _MIN_FRAME_CHANGE_OVER_STD = 50.0, 5.0
+_MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
-_MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
+_MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_NEGLIGIBLE_ORIGIN_SENSITIVITY = 1e-3
+_MAX_ORIGIN_SENSITIVITY_TO_UNKNOWNS = 1e-3
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -69,25 +69,25 @@ class PoseFrame:
     Attributes:
         p_SoPo_S: (3,) origin of P from So, in S [m].
         R_SP: (3, 3) rotation from axes of P to those of S.
-        position_deviations_m: (3,) standard deviations of the origin [m]; inf if undetermined.
-        rotation_deviations_deg: (3,) standard deviations of R_SP about the axes of S [deg].
+        position_stds_m: (3,) standard deviations of the origin [m]; inf if undetermined.
+        rotation_stds_deg: (3,) standard deviations of R_SP about the axes of S [deg].
         is_shifted, is_rotated: whether origin, axes differ significantly from the description.
     """
 
     p_SoPo_S: Array
     R_SP: Array
-    position_deviations_m: Array
-    rotation_deviations_deg: Array
+    position_stds_m: Array
+    rotation_stds_deg: Array
     is_shifted: bool
     is_rotated: bool
 
     @property
     def is_position_known(self) -> NDArray[np.bool_]:
-        return np.asarray(self.position_deviations_m < MAX_KNOWN_SHIFT_STD_M)
+        return np.asarray(self.position_stds_m < MAX_KNOWN_FRAME_SHIFT_STD_M)
 
     @property
     def is_rotation_known(self) -> NDArray[np.bool_]:
-        return np.asarray(self.rotation_deviations_deg < MAX_KNOWN_ROTATION_STD_DEG)
+        return np.asarray(self.rotation_stds_deg < MAX_KNOWN_FRAME_ROTATION_STD_DEG)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,17 +96,17 @@ class PoseMotion:
 
     Attributes:
         splines: splines of the poses, on the wrench's clock.
-        delay_s, delay_deviation_s: delay of the motion behind the wrench, and its standard
+        delay_s, delay_std_s: delay of the motion behind the wrench, and its standard
             deviation [s]; inf if undetermined.
         clock_rate_error: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
-        is_imu_consistent: whether an IMU agrees with the poses; True without one.
+        is_imu_consistent_with_poses: whether an IMU agrees with the poses; True without one.
     """
 
     splines: PoseSplines
     delay_s: float
-    delay_deviation_s: float
+    delay_std_s: float
     clock_rate_error: float
-    is_imu_consistent: bool
+    is_imu_consistent_with_poses: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class PoseEstimate(PoseMotion):
     @property
     def theta(self) -> Array:
         """Estimate (16,) of [offsets; phi] [SI]."""
-        return self.fit.state.theta
+        return self.fit.parameters.theta
 
     @property
     def covariance(self) -> Array:
@@ -160,7 +160,7 @@ def estimate_from_poses(
     excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
-        found, _, window = _find_motion(
+        found, _, window = _find_splines_and_delay(
             *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_SHARED_INSTANTS
         )
         splines, late, grid = found.splines, found.delay_s, window.grid
@@ -186,21 +186,21 @@ def estimate_from_poses(
 
         seen = estimate_units_and_axes(best)
         start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)
-        fit_free = np.ones(NUM_PARAMETERS, bool)
+        fit_free = np.ones(NUM_RIGID_PARAMETERS, bool)
         fit_free[16] = delay is None
         fit_free[LEVER_PARAMETERS], fit_free[ROTATION_PARAMETERS] = p_SoPo_S is None, R_SP is None
         fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
-            with_frame = fit_free | (np.arange(NUM_PARAMETERS) > 16)
+            with_frame = fit_free | (np.arange(NUM_RIGID_PARAMETERS) > 16)
             free = fit_rigid_from(_initial_parameters_with_free_frame(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
-            delay_s=spectra.delay + fit.state.delay_s,
-            delay_deviation_s=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
+            delay_s=spectra.delay + fit.parameters.delay_s,
+            delay_std_s=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
             clock_rate_error=found.clock_rate_error,
-            is_imu_consistent=found.is_imu_consistent,
+            is_imu_consistent_with_poses=found.is_imu_consistent_with_poses,
             fit=fit,
-            frame=_estimate_frame(free, start),
+            frame=_pose_frame_of_fit(free, start),
             free_frame_fit=free,
             units_and_axes=seen,
             t=grid.t,
@@ -222,16 +222,16 @@ def fit_motion_to_load(
 ) -> PoseMotion:
     """Return the motion from poses of S with which a load (6, 16), Eq. (T73), fits best."""
     with one_blas_thread():
-        motion, last, _ = _find_motion(
+        motion, last, _ = _find_splines_and_delay(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
             fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
             load=load,
         )
         known = delay is not None
-        return replace(motion, delay_deviation_s=0.0 if known else delay_deviation(last))
+        return replace(motion, delay_std_s=0.0 if known else delay_std(last))
 
 
-def _find_motion(
+def _find_splines_and_delay(
     t: ArrayLike,
     wrench: ArrayLike,
     poses: Poses,
@@ -257,13 +257,13 @@ def _find_motion(
         )
     top = min(
         MAX_FREQUENCY_HZ,
-        _MAX_FREQUENCY_OVER_RATE * poses.rate,
-        _MAX_FREQUENCY_OVER_RATE * grid.stride / grid.dt,
+        _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * poses.rate,
+        _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * grid.stride / grid.dt,
     )
     whole = FitWindow(grid, taper, gravity, top)
     rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
-    near_poses = _select_poses_around(poses, part.grid)
+    near_poses = _select_poses_near_grid(poses, part.grid)
     cache = splines_of_averaged_poses(near_poses)
     spacing, late = guess_knot_spacing(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
@@ -289,15 +289,15 @@ def _find_motion(
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _select_poses_around(poses: Poses, grid: WrenchGrid) -> Poses:
-    inside = (poses.t >= grid.t[0] - 2 * DELAY_SEARCH_RANGE_S) & (
-        poses.t <= grid.t[-1] + 2 * DELAY_SEARCH_RANGE_S
+def _select_poses_near_grid(poses: Poses, grid: WrenchGrid) -> Poses:
+    inside = (poses.t >= grid.t[0] - 2 * DELAY_SEARCH_HALF_RANGE_S) & (
+        poses.t <= grid.t[-1] + 2 * DELAY_SEARCH_HALF_RANGE_S
     )
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
 def _part_with_most_varied_force(grid: WrenchGrid) -> slice:
-    rows, length = len(grid.t), round(MOTION_SEARCH_DURATION_S / grid.dt)
+    rows, length = len(grid.t), round(SEARCHED_RECORD_PART_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -319,7 +319,7 @@ def _taper_without_gaps(
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
-    for k in np.flatnonzero(np.diff(stamps) > _MIN_GAP_S):
+    for k in np.flatnonzero(np.diff(stamps) > _MIN_EXCLUDED_POSE_GAP_S):
         bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
     return exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
@@ -339,13 +339,15 @@ def _initial_parameters_with_free_frame(
 ) -> RigidParameters:
     turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R_PS) < 2.9
     if not turned:
-        return fit.state
+        return fit.parameters
     R = seen.R_SP.T
-    return RigidParameters(np.zeros(16), fit.state.delay_s, R @ start.R_PS.T @ start.p_PoSo_P, R)
+    return RigidParameters(
+        np.zeros(16), fit.parameters.delay_s, R @ start.R_PS.T @ start.p_PoSo_P, R
+    )
 
 
-def _estimate_frame(free: RigidFit, start: RigidParameters) -> PoseFrame:
-    R_SP, r = free.state.R_PS.T, free.state.p_PoSo_P
+def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
+    R_SP, r = free.parameters.R_PS.T, free.parameters.p_PoSo_P
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
     # p = -R^T r, and R exp([rho x]) changes it to p - rho x p.
@@ -354,32 +356,32 @@ def _estimate_frame(free: RigidFit, start: RigidParameters) -> PoseFrame:
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE_ORIGIN_SENSITIVITY
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_SENSITIVITY_TO_UNKNOWNS
         deviations = np.where(lost, np.inf, deviations)
-    moved = free.state.p_PoSo_P - start.p_PoSo_P
-    turned = Rotation.from_matrix(start.R_PS.T @ free.state.R_PS).as_rotvec()
+    moved = free.parameters.p_PoSo_P - start.p_PoSo_P
+    turned = Rotation.from_matrix(start.R_PS.T @ free.parameters.R_PS).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    limits = np.radians([MIN_REPORTED_ROTATION_DEG, MAX_KNOWN_ROTATION_STD_DEG])
-    shifted = _is_significant(
-        moved, covariance[:3, :3], MIN_REPORTED_SHIFT_M, MAX_KNOWN_SHIFT_STD_M
+    limits = np.radians([MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG])
+    shifted = _is_frame_moved(
+        moved, covariance[:3, :3], MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
     )
-    tilted = _is_significant(turned, covariance[3:, 3:], *limits)
+    tilted = _is_frame_moved(turned, covariance[3:, 3:], *limits)
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,
-        position_deviations_m=deviations,
-        rotation_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
-        is_shifted=bool(wald > _MIN_WALD_STATISTIC and shifted),
-        is_rotated=bool(wald > _MIN_WALD_STATISTIC and tilted),
+        position_stds_m=deviations,
+        rotation_stds_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
+        is_shifted=bool(wald > _MIN_FRAME_CHANGE_WALD_STATISTIC and shifted),
+        is_rotated=bool(wald > _MIN_FRAME_CHANGE_WALD_STATISTIC and tilted),
     )
 
 
-def _is_significant(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
+def _is_frame_moved(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)
     direction = x / (length + 1e-300)
     deviation = float(np.sqrt(direction @ covariance @ direction))
-    significant = length > max(least, _MIN_SIGNIFICANT_DEVIATIONS * deviation)
+    significant = length > max(least, _MIN_FRAME_CHANGE_OVER_STD * deviation)
     return bool(significant and deviation < largest_deviation)

@@ -12,17 +12,17 @@ from drake_teleop.logs.pose_motion.poses import ImuData
 from drake_teleop.logs.pose_motion.spectra import ComplexArray, end_taper, exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import ImuSplineRows, PoseSplines
 
-_PRIOR_GAIN_STD = 0.1
-_MAX_FIT_STEPS, _MAX_TIME_SHIFT_S, _POWER_ITERATIONS, _MIN_EFFECTIVE_FREQUENCIES = 4, 0.1, 10, 40
+_GAIN_ERROR_PRIOR_STD = 0.1
+_SENSOR_FIT_STEPS, _MAX_IMU_SHIFT_S, _NOISE_POWER_STEPS, _MIN_NOISE_FREQUENCIES = 4, 0.1, 10, 40
 _MAX_GAIN_ERROR = 0.2  # largest entry of D
 # Share of 1 / h that splines pass, and largest unexplained share of the motion.
-_PASSED_FREQUENCY_OVER_KNOT_RATE, _MAX_UNEXPLAINED_SHARE = 0.25, 0.05
+_COMPARED_FREQUENCY_OVER_KNOT_RATE, _MAX_RESIDUAL_OVER_MOTION_POWER = 0.25, 0.05
 # Rates of comparison and of added rows [Hz], and least length of a comparison [s].
-_COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_COMPARISON_LENGTH_S = 125.0, 500.0, 2.0
+_COMPARED_IMU_RATE_HZ, _ADDED_IMU_ROWS_RATE_HZ, _MIN_COMPARED_DURATION_S = 125.0, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class _SensorModel:
+class _ImuSensorModel:
     """Sensor model y = bias + (1 + gain_errors) x(t + time_shift_s) for the motion x."""
 
     gain_errors: Array
@@ -37,7 +37,7 @@ class _SensorModel:
 def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
     """Return IMU data corrected to fit splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.estimate_pose_noise())
-    averaged, sensors = imu.average_to_rate(_COMPARISON_RATE_HZ), []
+    averaged, sensors = imu.average_to_rate(_COMPARED_IMU_RATE_HZ), []
     for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
         sensor = None
         if y is not None:
@@ -49,7 +49,7 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     fitted = [sensor for sensor in sensors if sensor is not None]
     if not fitted:
         return None
-    rows = imu.average_to_rate(_ROWS_RATE_HZ)
+    rows = imu.average_to_rate(_ADDED_IMU_ROWS_RATE_HZ)
     t = rows.t + fitted[-1].time_shift_s  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
@@ -58,11 +58,11 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     )
     own = [0.0 if sensor is None else sensor.noise_power for sensor in sensors]
     imu_rows = ImuSplineRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
-    imu_rows = imu_rows.from_sensor_axes(
+    imu_rows = imu_rows.with_data_in_sensor_axes(
         PoseSplines(splines.poses, splines.spacing), gravity_W, s, omega
     )  # then by poses and IMU together
     both = PoseSplines(splines.poses, splines.spacing, imu_rows)
-    return imu_rows.from_sensor_axes(both, gravity_W, s, omega)
+    return imu_rows.with_data_in_sensor_axes(both, gravity_W, s, omega)
 
 
 def _fit_sensor_model(
@@ -72,7 +72,7 @@ def _fit_sensor_model(
     gravity_W: Array,
     which: int,
     pose_noise: tuple[float, int],
-) -> _SensorModel | None:
+) -> _ImuSensorModel | None:
     """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y.
 
     `which` is 0 for an accelerometer, 1 for a gyroscope.
@@ -84,12 +84,12 @@ def _fit_sensor_model(
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
     taper = exclude_from_taper(
-        end_taper(even, start + _MAX_TIME_SHIFT_S, stop - _MAX_TIME_SHIFT_S), lost, dt
+        end_taper(even, start + _MAX_IMU_SHIFT_S, stop - _MAX_IMU_SHIFT_S), lost, dt
     )
-    if (taper > 0.5).sum() * dt < _MIN_COMPARISON_LENGTH_S:
+    if (taper > 0.5).sum() * dt < _MIN_COMPARED_DURATION_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
-    used = frequency <= _PASSED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
+    used = frequency <= _COMPARED_FREQUENCY_OVER_KNOT_RATE / splines.spacing
     noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
     energy = float(np.sum(taper**2)) / dt
 
@@ -102,7 +102,7 @@ def _fit_sensor_model(
     one = tapered_spectrum(np.ones((len(even), 1)))
     tau = 0.0
     power = least
-    for step in range(_MAX_FIT_STEPS):
+    for step in range(_SENSOR_FIT_STEPS):
         x = splines.motion(even + tau, gravity_W)[which]
         X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))
         if step == 0:
@@ -112,14 +112,14 @@ def _fit_sensor_model(
         residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
         power = _estimate_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
-        if abs(tau) > _MAX_TIME_SHIFT_S:
+        if abs(tau) > _MAX_IMU_SHIFT_S:
             return None
     if (
         np.abs(D).max() > _MAX_GAIN_ERROR
-        or residual[1:].sum() > _MAX_UNEXPLAINED_SHARE * (np.abs(X[1:]) ** 2).sum()
+        or residual[1:].sum() > _MAX_RESIDUAL_OVER_MOTION_POWER * (np.abs(X[1:]) ** 2).sum()
     ):
         return None
-    return _SensorModel(D, b, tau, power)
+    return _ImuSensorModel(D, b, tau, power)
 
 
 def _fit_sensor_parameters(
@@ -134,7 +134,7 @@ def _fit_sensor_parameters(
     A = (columns * weight[:, None, None]).reshape(3 * K, 13)
     right = (y * weight[:, None]).ravel()
     gram = (A.conj().T @ A).real
-    gram[range(9), range(9)] += 1.0 / _PRIOR_GAIN_STD**2
+    gram[range(9), range(9)] += 1.0 / _GAIN_ERROR_PRIOR_STD**2
     found = np.linalg.solve(gram, (A.conj().T @ right).real)
     return found[:9].reshape(3, 3), found[9:12], float(found[12])
 
@@ -143,8 +143,8 @@ def _estimate_noise_power(
     residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
 ) -> float:
     power = max(float(np.median(residual)), white)
-    for _ in range(_POWER_ITERATIONS):
+    for _ in range(_NOISE_POWER_STEPS):
         weight = 1.0 / (power + pose_noise) ** 2
         power = max(float(weight @ (residual - pose_noise) / weight.sum()), white)
     effective = float(np.sum((white / (white + pose_noise)) ** 2))
-    return power if effective > _MIN_EFFECTIVE_FREQUENCIES else white
+    return power if effective > _MIN_NOISE_FREQUENCIES else white

@@ -18,7 +18,7 @@ from drake_teleop.logs.pose_motion.spectra import (
     WrenchGrid,
     end_taper,
     make_frequency_bands,
-    random_walk_shape,
+    random_walk_relative_power,
     second_moments,
     shift_spectrum,
     shift_taper,
@@ -35,18 +35,18 @@ from drake_teleop.logs.pose_motion.splines import (
 
 TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried first; then two between the best and its neighbours [s]."""
-DELAY_SEARCH_RANGE_S = 0.25
+DELAY_SEARCH_HALF_RANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
-MIN_NOISE_OVER_WRENCH = 1e-7
+MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-7
 """Least noise of a channel relative to the wrench."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
-_FIT_ITERATIONS = 4
-_SEARCH_RATE_HZ = 125.0
-_RANK_TOLERANCE, _MIN_FULL_RANK_PIVOT = 1e-12, 1e-8
+_REWEIGHTING_ITERATIONS = 4
+_MIN_POSES_PER_S = 125.0
+_MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RELATIVE_PIVOT_FOR_INVERSE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
-_TRIED_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
-_MIN_DRIFT_COST_REDUCTION = 3.0
-_SPACING_MARGIN, _SPACING_MARGIN_WITH_KNOWN_LOAD, _MIN_DELAY_COST_RISE = 0.84, 0.92, 25.0
+_TRIED_OFFSET_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
+_MIN_COST_REDUCTION_BY_DRIFT = 3.0
+_SPACING_OVER_BEST, _SPACING_OVER_BEST_KNOWN_LOAD, _MIN_COST_RISE_OFF_DELAY = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +56,24 @@ class LinearFit:
     Attributes:
         coefficients: (6, 16); 0 for signals that are 0.
         covariance: (6, 16, 16) of the rows of coefficients.
-        power: (bands, 6) mean noise power.
-        costs: (6,) negative log likelihood of each channel.
+        noise_power: (bands, 6) mean noise power.
+        channel_costs: (6,) negative log likelihood of each channel.
     """
 
     coefficients: Array
     covariance: Array
-    power: Array
-    costs: Array
+    noise_power: Array
+    channel_costs: Array
 
     @property
     def cost(self) -> float:
         """Negative log likelihood, up to a constant, Eq. (T75)."""
-        return float(self.costs.sum())
+        return float(self.channel_costs.sum())
 
 
 def fit_linear_model(Z: Array, levels: NoiseLevels) -> LinearFit:
     """Fit the wrench by 16 signals of the motion, from second moments Z (bands, 38, 38)."""
-    return _fit_moments(*_moments_of_signals_and_wrench(Z), levels)
+    return _fit_to_moments(*_moments_of_signals_and_wrench(Z), levels)
 
 
 def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
@@ -82,10 +82,10 @@ def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
     return zz, Z[..., :NUM_MOTION_SIGNALS, WRENCH_COLUMNS], powers
 
 
-def _fit_moments(
+def _fit_to_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    floor = _rounding_error_power(ff, levels.sizes)
+    floor = _rounding_error_of_wrench_powers(ff, levels.band_sizes)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -95,14 +95,14 @@ def _fit_moments(
     scale = np.where(size > 1e-18 * constant, 1.0 / np.sqrt(size + 1e-300), 0.0)
     both = scale[..., :, None] * scale[..., None, :]
     zz, zf = zz * both[..., None, :, :], zf * scale[..., None, :, None]
-    power = np.maximum(ff / levels.sizes[:, None], floor).mean(axis=-2, keepdims=True)
+    power = np.maximum(ff / levels.band_sizes[:, None], floor).mean(axis=-2, keepdims=True)
     power = np.broadcast_to(power, (*zf.shape[:-2], 6))
     flat = zz.reshape(*zz.shape[:-2], -1)
-    for _ in range(_FIT_ITERATIONS):
+    for _ in range(_REWEIGHTING_ITERATIONS):
         weight = 1.0 / power
         gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
         right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
-        inverse = _pseudo_inverses(gram)
+        inverse = _pseudo_inverses_of_grams(gram)
         C = (inverse @ right[..., None])[..., 0]
         across = np.swapaxes(C, -1, -2)[..., None, :, :]
         explained = np.sum((2.0 * zf - zz @ across) * across, axis=-2)
@@ -110,47 +110,47 @@ def _fit_moments(
     return LinearFit(
         coefficients=C * scale[..., None, :],
         covariance=0.5 * inverse * both[..., None, :, :],
-        power=power,
-        costs=levels.negative_log_likelihoods(power),
+        noise_power=power,
+        channel_costs=levels.negative_log_likelihoods(power),
     )
 
 
-def _pseudo_inverses(gram: Array) -> Array:
+def _pseudo_inverses_of_grams(gram: Array) -> Array:
     largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
     try:
         pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
-        if (pivots > _MIN_FULL_RANK_PIVOT * largest).all():
+        if (pivots > _MIN_RELATIVE_PIVOT_FOR_INVERSE * largest).all():
             return np.asarray(np.linalg.inv(gram))  # three times faster
     except np.linalg.LinAlgError:
         pass
     values, vectors = np.linalg.eigh(gram)
-    good = values > _RANK_TOLERANCE * values[..., -1:]
+    good = values > _MIN_RELATIVE_GRAM_EIGENVALUE * values[..., -1:]
     scaled = vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[..., None, :]
     return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
 def rounding_error_power(Z: Array, sizes: Array) -> Array:
     """Return the power (6,) of rounding errors in the wrench channels."""
-    return _rounding_error_power(_moments_of_signals_and_wrench(Z)[2], sizes)
+    return _rounding_error_of_wrench_powers(_moments_of_signals_and_wrench(Z)[2], sizes)
 
 
-def _rounding_error_power(ff: Array, sizes: Array) -> Array:
+def _rounding_error_of_wrench_powers(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
-    return np.maximum(MIN_NOISE_OVER_WRENCH**2 * both, 1e-60)
+    return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
     """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
     levels = NoiseLevels.white_within_groups(bands)
-    least = fit_linear_model(Z, levels).costs - _MIN_DRIFT_COST_REDUCTION
-    shape = levels.shape.copy()
-    for corner in _TRIED_DRIFT_CORNERS_HZ:
-        rising = np.repeat(random_walk_shape(bands, corner)[:, None], 6, axis=1)
-        costs = fit_linear_model(Z, replace(levels, shape=rising)).costs
+    least = fit_linear_model(Z, levels).channel_costs - _MIN_COST_REDUCTION_BY_DRIFT
+    shape = levels.relative_power.copy()
+    for corner in _TRIED_OFFSET_DRIFT_CORNERS_HZ:
+        rising = np.repeat(random_walk_relative_power(bands, corner)[:, None], 6, axis=1)
+        costs = fit_linear_model(Z, replace(levels, relative_power=rising)).channel_costs
         better = costs < least
         least, shape = np.where(better, costs, least), np.where(better, rising, shape)
-    return replace(levels, shape=shape)
+    return replace(levels, relative_power=shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +172,8 @@ class Spectra:
     motion_signals: Array
 
     @property
-    def delay_search_range_s(self) -> float:
-        return min(DELAY_SEARCH_RANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
+    def delay_search_half_range_s(self) -> float:
+        return min(DELAY_SEARCH_HALF_RANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
 
     @cached_property
     def is_taper_fixed(self) -> bool:
@@ -203,7 +203,7 @@ class Spectra:
         """Fit the coefficients of all signals, or only the constants if the load is known."""
         Z, load = second_moments(self.signals, self.wrench, self.bands), self.grid.known_load
         levels = NoiseLevels.white_within_groups(self.bands)
-        fit = _fit_moments(*_moments_of_signals_and_wrench(Z), levels, load)
+        fit = _fit_to_moments(*_moments_of_signals_and_wrench(Z), levels, load)
         if load is None:
             return fit
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
@@ -219,22 +219,22 @@ class Spectra:
             zz, zf = self._delayed_moments(np.asarray(delays))
         ff = self.bands.sums_over_bands(np.abs(self.wrench) ** 2)
         levels = NoiseLevels.white_within_groups(self.bands)
-        return _fit_moments(zz, zf, ff, levels, self.grid.known_load).costs.sum(axis=-1)
+        return _fit_to_moments(zz, zf, ff, levels, self.grid.known_load).channel_costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
         """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
         bands, Z = self.bands, second_moments(self.signals, self.wrench, self.bands)
-        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * bands.weight[:, None]
+        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * bands.frequency_weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
         flat = products.reshape(len(products), -1)
         angle = 2.0 * np.pi * np.outer(delays - self.delay, bands.frequency)
         cosine, sine = np.cos(angle), np.sin(angle)
-        starts = np.searchsorted(bands.band, np.arange(bands.count + 1))
-        sums = np.empty((len(delays), bands.count, flat.shape[1]))
-        for k in range(bands.count):
+        starts = np.searchsorted(bands.band_of_frequency, np.arange(bands.num_bands + 1))
+        sums = np.empty((len(delays), bands.num_bands, flat.shape[1]))
+        for k in range(bands.num_bands):
             part = slice(starts[k], starts[k + 1])
             sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
-        zf = sums.reshape(len(delays), bands.count, NUM_MOTION_SIGNALS, 7)
+        zf = sums.reshape(len(delays), bands.num_bands, NUM_MOTION_SIGNALS, 7)
         zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, WRENCH_COLUMNS], Z[:, 0, 0]
         zz = np.repeat(Z[None, :, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS], len(delays), axis=0)
         zz[..., 0] = zz[..., 0, :] = zf[..., 6]
@@ -273,7 +273,7 @@ class FitWindow:
         return Spectra(bands, wrench, signals, delay, self.grid, self.taper, zeta)
 
 
-def best_delay(
+def find_best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_DELAY_STEP_S
 ) -> tuple[float, float]:
     """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
@@ -290,14 +290,14 @@ def best_delay(
     return float(at[best]), float(costs[best])
 
 
-def delay_deviation(spectra: Spectra) -> float:
+def delay_std(spectra: Spectra) -> float:
     """Return the standard deviation of the delay [s]; inf if undetermined."""
-    reach = spectra.delay_search_range_s
+    reach = spectra.delay_search_half_range_s
     beside = np.array([-_FINE_DELAY_STEP_S, 0.0, _FINE_DELAY_STEP_S])
     left, least, right = spectra.costs_at_delays(spectra.delay + beside)
     far = spectra.costs_at_delays(spectra.delay + np.arange(-reach, reach, _COARSE_DELAY_STEP_S))
     bend = left - 2.0 * least + right
-    if bend <= 0.0 or far.max() - least < _MIN_DELAY_COST_RISE or far.min() < least - 1.0:
+    if bend <= 0.0 or far.max() - least < _MIN_COST_RISE_OFF_DELAY or far.min() < least - 1.0:
         return np.inf
     return float(_FINE_DELAY_STEP_S / np.sqrt(bend))
 
@@ -309,14 +309,14 @@ def guess_knot_spacing(
 
     The delay is not changed if `known`.
     """
-    spacings, found = _allowed_spacings(cache)[::2], []
+    spacings, found = _knot_spacings_for_pose_rate(cache)[::2], []
     start = window.spectra_at_delay(cache.splines_with_spacing(spacings[0]), delay)
     for h in spacings:
         spectra = start.with_motion(cache.splines_with_spacing(h), window.gravity_W, delay)
         if known:
             found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = best_delay(spectra, spectra.delay_search_range_s, _FINE_DELAY_STEP_S)
+        late, cost = find_best_delay(spectra, spectra.delay_search_half_range_s, _FINE_DELAY_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
@@ -333,7 +333,7 @@ def choose_knot_spacing(
     )
     found = []
     for cache in choices:
-        spacings = _allowed_spacings(cache)
+        spacings = _knot_spacings_for_pose_rate(cache)
 
         def cost(h: float, cache: SplineCache = cache) -> float:
             return (
@@ -344,35 +344,35 @@ def choose_knot_spacing(
 
         costs = [(cost(h), h) for h in spacings]
         middle = min(costs)[1]
-        between = [float(np.sqrt(middle * h)) for h in _neighbouring_spacings(middle, spacings)]
+        between = [float(np.sqrt(middle * h)) for h in _adjacent_knot_spacings(middle, spacings)]
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
-    finer = _SPACING_MARGIN if window.grid.known_load is None else _SPACING_MARGIN_WITH_KNOWN_LOAD
+    finer = _SPACING_OVER_BEST if window.grid.known_load is None else _SPACING_OVER_BEST_KNOWN_LOAD
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
         last = start.with_motion(cache.splines_with_spacing(best), window.gravity_W, delay)
-        delay, _ = best_delay(last, 3 * _COARSE_DELAY_STEP_S)
+        delay, _ = find_best_delay(last, 3 * _COARSE_DELAY_STEP_S)
     return cache, best, delay
 
 
 def splines_of_averaged_poses(poses: Poses) -> SplineCache:
     """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
+    return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _MIN_POSES_PER_S + 1e-6))))
 
 
-def _neighbouring_spacings(h: float, spacings: list[float]) -> list[float]:
+def _adjacent_knot_spacings(h: float, spacings: list[float]) -> list[float]:
     k = spacings.index(h)
     return spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]
 
 
-def _allowed_spacings(cache: SplineCache) -> list[float]:
+def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
     return [h for h in TRIED_KNOT_SPACINGS_S if h * cache.rate >= MIN_POSES_PER_KNOT] or [
         TRIED_KNOT_SPACINGS_S[0]
     ]
 
 
-_MAX_CLOCK_RATE_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
+_MAX_CLOCK_RATE_ITERATIONS, _MIN_CLOCK_RATE_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
 _MAX_DELAY_CHANGE_BY_CLOCK_S = 0.2
 
@@ -384,10 +384,10 @@ def estimate_clock_rate_error(
     first, grid = window.spectra_at_delay(cache.splines_with_spacing(spacing), delay), window.grid
     now, best = first, 0.0
     least = start = now.fit_coefficients().cost
-    for _ in range(_MAX_CLOCK_RATE_STEPS):
+    for _ in range(_MAX_CLOCK_RATE_ITERATIONS):
         step, gain = _clock_rate_and_delay_step(now)
         trial = best + step
-        if gain < _MIN_LIKELIHOOD_GAIN and best == 0.0:
+        if gain < _MIN_CLOCK_RATE_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_DELAY_CHANGE_BY_CLOCK_S:
             break
@@ -397,7 +397,7 @@ def estimate_clock_rate_error(
         if not cost < least:
             break
         least, best = cost, trial
-    return best if 2.0 * (start - least) > _MIN_LIKELIHOOD_GAIN else 0.0
+    return best if 2.0 * (start - least) > _MIN_CLOCK_RATE_LIKELIHOOD_GAIN else 0.0
 
 
 def correct_clock_rate(poses: Poses, rate: float, grid: WrenchGrid, delay: float) -> Poses:
@@ -416,7 +416,9 @@ def _clock_rate_and_delay_step(spectra: Spectra) -> tuple[float, float]:
     moves = [signal_spectrum(grid, spectra.taper, x, count) for x in (from_middle * change, change)]
     gram, right = np.zeros((2, 2)), np.zeros(2)
     for c, C in enumerate(fit.coefficients):
-        weight = np.sqrt(spectra.bands.weight / fit.power[spectra.bands.band, c])[:, None]
+        weight = np.sqrt(
+            spectra.bands.frequency_weight / fit.noise_power[spectra.bands.band_of_frequency, c]
+        )[:, None]
         columns = np.column_stack([free, *(x @ C for x in moves)])
         left = (spectra.wrench[:, c] - spectra.signals @ C)[:, None]
         y = (np.hstack([columns, left]) * weight).view(np.float64).reshape(count, -1, 2)

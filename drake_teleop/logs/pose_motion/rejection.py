@@ -6,26 +6,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.linear_model import MIN_NOISE_OVER_WRENCH, Spectra
-from drake_teleop.logs.pose_motion.spectra import WrenchGrid, distance_to_flag
-from drake_teleop.logs.pose_motion.splines import COLUMNS_ZERO_AT_REST
+from drake_teleop.logs.pose_motion.linear_model import MIN_NOISE_STD_OVER_WRENCH_RMS, Spectra
+from drake_teleop.logs.pose_motion.spectra import WrenchGrid, instants_to_nearest_flag
+from drake_teleop.logs.pose_motion.splines import SIGNALS_ZERO_AT_REST
 
 NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so disturbances"
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
-_HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
+_HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS = 3.0, 4.5, 30
 _STD_PER_NORMAL_MAD = 1.4826
-_MAX_STD_GROWTH = 2.5
-_HALF_GAIN_OVER_KNOT_RATE = 0.3
-_MIN_MARGIN_S = 0.1
+_MAX_FIT_STD_GROWTH = 2.5
+_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE = 0.3
+_MIN_REJECTION_MARGIN_S = 0.1
 """Least margin on both sides of a rejected time span [s]."""
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return (M,) True for contact, impact or saturation, and a note for the user."""
-    # A Gaussian gain, one half at `_HALF_GAIN_OVER_KNOT_RATE` / h, does not ring.
-    gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_OVER_KNOT_RATE) ** 2)
+    # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
+    gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid
     x, y = (
         _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)
@@ -37,26 +37,26 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
         x = test_signals = x[:, used] / size[used]
     else:
         y = y - x @ grid.known_load.T
-        test_signals = x[:, COLUMNS_ZERO_AT_REST] @ grid.known_load[:3, COLUMNS_ZERO_AT_REST].T
+        test_signals = x[:, SIGNALS_ZERO_AT_REST] @ grid.known_load[:3, SIGNALS_ZERO_AT_REST].T
         x, test_signals = x[:, :1] / size[0], np.linalg.norm(test_signals, axis=1, keepdims=True)
     weights = inside.astype(float)
-    for _ in range(_MAX_FITS):
+    for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        distances = _normalized_residual_distances(x, y, weights, inside)
-        weights = inside * np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
+        distances = _max_residuals_over_std(x, y, weights, inside)
+        weights = inside * np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
     rejected = np.zeros(len(x), bool)
-    for _ in range(_MAX_FITS):
+    for _ in range(_MAX_ROBUST_FITS):
         last = rejected
-        rejected = _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT
+        rejected = _max_residuals_over_std(x, y, weights, inside) > _REJECTION_STDS
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break
     if not rejected.any():
         return rejected, ""
-    rejected = distance_to_flag(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
-    if _std_growth_by_rejection(test_signals, inside, inside & ~rejected) > _MAX_STD_GROWTH:
+    rejected = instants_to_nearest_flag(rejected) * grid.dt <= max(_MIN_REJECTION_MARGIN_S, spacing)
+    if _std_growth_by_rejection(test_signals, inside, inside & ~rejected) > _MAX_FIT_STD_GROWTH:
         return np.zeros(len(x), bool), NOTHING_REJECTED_NOTE
     return rejected, ""
 
@@ -67,16 +67,14 @@ def _spectrum_to_time_signal(spectrum: NDArray[np.complex128], grid: WrenchGrid)
     return np.asarray(np.fft.irfft(full, grid.transform_length, axis=0)[: len(grid.t)])
 
 
-def _normalized_residual_distances(
-    x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]
-) -> Array:
+def _max_residuals_over_std(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
     scale = _STD_PER_NORMAL_MAD * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     return np.asarray(
-        (residual / np.maximum(scale, MIN_NOISE_OVER_WRENCH * rms + 1e-30)).max(axis=1)
+        (residual / np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)).max(axis=1)
     )
 
 

@@ -10,29 +10,29 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, parameter_errors_by_gains
+from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
 from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
 from drake_teleop.logs.pose_motion.spectra import (
-    MOMENTS_SIZE,
+    NUM_MOMENT_SIGNALS,
     SIGNAL_RATE_COLUMNS,
     WRENCH_COLUMNS,
     NoiseLevels,
 )
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SIGNALS
 
-NUM_PARAMETERS = 23
+NUM_RIGID_PARAMETERS = 23
 """Number of parameters: [offsets; phi] (16), tau, r (3), rho (3)."""
 OFFSET_AND_LOAD_PARAMETERS = slice(0, 16)
 DELAY_PARAMETER = slice(16, 17)
 LEVER_PARAMETERS = slice(17, 20)
 ROTATION_PARAMETERS = slice(20, 23)
-_MAX_FIT_STEPS, _CONVERGENCE_TOLERANCE = 40, 1e-4
-_MAX_RIGID_MISFIT_OVER_DEGREES, _GAIN_MISFIT_MARGIN, _NOISE_MISFIT_OVER_DEGREES = 4.0, 1.5, 1.5
-_MAX_PARAMETER_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_MIN_WRENCH_NOISE_SHARE = 0.1
-_ROTATION_STEP_RAD = 1e-4  # rad, step of a numerical derivative
-_RANK_TOLERANCE = 1e-12
+_MAX_RIGID_FIT_STEPS, _MAX_CONVERGED_STEP_OVER_STD = 40, 1e-4
+_MAX_RIGID_MISFIT_OVER_DOF, _MAX_GAIN_MISFIT_OVER_EXPECTED, _NOISE_MISFIT_OVER_DOF = 4.0, 1.5, 1.5
+_MAX_PARAMETER_FIT_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MIN_WRENCH_NOISE_OVER_RESIDUAL = 0.1
+_ROTATION_DIFFERENCE_STEP_RAD = 1e-4  # rad, step of a numerical derivative
+_MIN_RELATIVE_GRAM_EIGENVALUE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,36 +56,36 @@ class RigidFit:
     """Fit of a rigid load to wrench and poses.
 
     Attributes:
-        state: estimated parameters; `delay_s` is relative to the delay of the moments.
+        parameters: estimated; `delay_s` is relative to the delay of the moments.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
         misfit, degrees_of_freedom: twice the log likelihood ratio to the linear model, and its
             degrees of freedom.
-        misfit_of_gains: expected increase of the misfit by the stated gain errors.
+        expected_misfit_by_gains: expected increase of the misfit by the stated gain errors.
     """
 
-    state: RigidParameters
+    parameters: RigidParameters
     covariance: Array
     misfit: float
     degrees_of_freedom: float
-    misfit_of_gains: float = 0.0
+    expected_misfit_by_gains: float = 0.0
 
     @property
     def is_rigid(self) -> bool:
         """Whether the misfit is below four times its degrees of freedom."""
-        return self.misfit < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom
+        return self.misfit < _MAX_RIGID_MISFIT_OVER_DOF * self.degrees_of_freedom
 
     @property
     def is_explained_by_gains(self) -> bool:
         """Whether a rigid load with the stated gain errors explains the wrench."""
-        by_gains = _GAIN_MISFIT_MARGIN * self.misfit_of_gains
-        return self.misfit < _MAX_RIGID_MISFIT_OVER_DEGREES * self.degrees_of_freedom + by_gains
+        by_gains = _MAX_GAIN_MISFIT_OVER_EXPECTED * self.expected_misfit_by_gains
+        return self.misfit < _MAX_RIGID_MISFIT_OVER_DOF * self.degrees_of_freedom + by_gains
 
     @property
-    def deviation_inflation(self) -> float:
+    def std_inflation_by_misfit(self) -> float:
         """Factor (>= 1) on standard deviations due to misfit."""
-        left = self.misfit - _GAIN_MISFIT_MARGIN * self.misfit_of_gains
-        by_noise = _NOISE_MISFIT_OVER_DEGREES * self.degrees_of_freedom
+        left = self.misfit - _MAX_GAIN_MISFIT_OVER_EXPECTED * self.expected_misfit_by_gains
+        by_noise = _NOISE_MISFIT_OVER_DOF * self.degrees_of_freedom
         return float(np.sqrt(max(1.0, left / by_noise)))
 
 
@@ -101,7 +101,7 @@ def motion_transformation_matrix(R: Array, r: Array) -> Array:
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
     M[7:10, 10:16] = R.T @ centripetal_matrix(r)
     M[10:13, 7:10] = R.T
-    M[13:19, 10:16] = _rotated_products(R)
+    M[13:19, 10:16] = _rotation_of_omega_products(R)
     return M
 
 
@@ -113,20 +113,20 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
 
     `removed_weight` [m, m c] (4,) is the load whose weight the robot removed from the wrench.
     """
-    C = _coefficients_with_full_weight(phi)
+    C = _coefficients_without_removed_weight(phi)
     if removed_weight is not None:
-        weight = _coefficients_with_full_weight(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = _coefficients_without_removed_weight(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
 
-def _coefficients_with_full_weight(phi: Array) -> Array:
+def _coefficients_without_removed_weight(phi: Array) -> Array:
     theta = np.concatenate([np.zeros(6), phi])
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
     return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
 
 
-def _rotated_products(R: Array) -> Array:
+def _rotation_of_omega_products(R: Array) -> Array:
     out = np.empty((6, 6))
     for row, (i, j) in enumerate(_OMEGA_PRODUCT_PAIRS):
         for column, (k, m) in enumerate(_OMEGA_PRODUCT_PAIRS):
@@ -149,23 +149,25 @@ def fit_rigid(
     Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
     `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
     """
-    record = _FitData(Z, Q, levels, free, linear.power)
+    record = _FitData(Z, Q, levels, free, linear.noise_power)
     solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
-    plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.state)
-    least = rounding_error_power(record.moments, levels.sizes)
-    power = np.maximum(levels.noise_power(_residual_channel_powers(record, plain.state)), least)
+    plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.parameters)
+    least = rounding_error_power(record.moments, levels.band_sizes)
+    power = np.maximum(
+        levels.noise_power(_residual_channel_powers(record, plain.parameters)), least
+    )
     fit = RigidFit(
-        solution.state,
+        solution.parameters,
         covariance=np.zeros((0, 0)),
         misfit=2.0 * (float(levels.negative_log_likelihoods(power).sum()) - linear.cost),
         degrees_of_freedom=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
-        misfit_of_gains=_misfit_of_gains(record, plain, gain),
+        expected_misfit_by_gains=_expected_misfit_by_gains(record, plain, gain),
     )
     if not fit.is_rigid:
-        solution = _solve_rigid_fit(record, solution.state, one_weight=True)
-        fit = replace(fit, state=solution.state)
-    covariance = _parameter_covariance(record, solution, fit.deviation_inflation, gain)
+        solution = _solve_rigid_fit(record, solution.parameters, one_weight=True)
+        fit = replace(fit, parameters=solution.parameters)
+    covariance = _parameter_covariance(record, solution, fit.std_inflation_by_misfit, gain)
     return replace(fit, covariance=covariance)
 
 
@@ -173,40 +175,40 @@ def fit_rigid(
 class _FitData:
     moments: Array
     noise_moments: Array
-    levels: NoiseLevels
-    free: NDArray[np.bool_]
-    power: Array
+    noise_levels: NoiseLevels
+    is_free: NDArray[np.bool_]
+    linear_noise_power: Array
 
 
 @dataclass(frozen=True, eq=False)
 class _RigidSolution:
-    state: RigidParameters
-    derivative: Array
-    weights: Array
+    parameters: RigidParameters
+    residual_derivative: Array
+    residual_weights: Array
     inverse_gram: Array
     residual_covariances: Array
-    undetermined: NDArray[np.bool_]
+    is_undetermined: NDArray[np.bool_]
 
 
 def _solve_rigid_fit(
     record: _FitData, state: RigidParameters, *, one_weight: bool = False
 ) -> _RigidSolution:
-    sizes, clean = record.levels.sizes, record.moments - record.noise_moments
-    R = _residual_covariances(record, state, record.power * sizes[:, None])
-    for _ in range(_MAX_FIT_STEPS):
+    sizes, clean = record.noise_levels.band_sizes, record.moments - record.noise_moments
+    R = _residual_covariances(record, state, record.linear_noise_power * sizes[:, None])
+    for _ in range(_MAX_RIGID_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
         if one_weight:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _residual_and_derivative(state)
         gram, right = _normal_equations(B, Le, clean, W)
-        inverse, undetermined = _inverse_of_free_parameters(gram, record.free)
+        inverse, undetermined = _inverse_of_free_parameters(gram, record.is_free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
-        step *= min(1.0, float(np.min(_MAX_PARAMETER_STEP / np.maximum(np.abs(step), 1e-300))))
-        state = _apply_step(state, step)
-        used = _used_degrees_of_freedom(B, record.moments, W, inverse)
+        step *= min(1.0, float(np.min(_MAX_PARAMETER_FIT_STEP / np.maximum(np.abs(step), 1e-300))))
+        state = _add_rigid_step(state, step)
+        used = _degrees_of_freedom_of_fit(B, record.moments, W, inverse)
         R = _residual_covariances(record, state, _residual_channel_powers(record, state), used)
-        if np.max(np.abs(step) / size) < _CONVERGENCE_TOLERANCE:
+        if np.max(np.abs(step) / size) < _MAX_CONVERGED_STEP_OVER_STD:
             break
     return _RigidSolution(state, B, W, inverse, R, undetermined)
 
@@ -214,12 +216,12 @@ def _solve_rigid_fit(
 def _parameter_covariance(
     record: _FitData, solution: _RigidSolution, inflation: float, gain: float
 ) -> Array:
-    inverse, undetermined = solution.inverse_gram, solution.undetermined
-    W, none = solution.weights, np.zeros((6, MOMENTS_SIZE))
+    inverse, undetermined = solution.inverse_gram, solution.is_undetermined
+    W, none = solution.residual_weights, np.zeros((6, NUM_MOMENT_SIGNALS))
     W = W @ solution.residual_covariances @ W
-    middle = _normal_equations(solution.derivative, none, record.moments, W)[0]
+    middle = _normal_equations(solution.residual_derivative, none, record.moments, W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
-    covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
+    covariance *= np.outer(*2 * [_std_factors_of_estimated_weights(record, solution)])
     larger = covariance * inflation**2
     if gain:
         clean = record.moments - record.noise_moments
@@ -233,16 +235,16 @@ def _parameter_covariance(
     return larger
 
 
-def _weight_estimation_factors(record: _FitData, solution: _RigidSolution) -> Array:
-    levels, B = record.levels, solution.derivative
+def _std_factors_of_estimated_weights(record: _FitData, solution: _RigidSolution) -> Array:
+    levels, B = record.noise_levels, solution.residual_derivative
     half = np.einsum("cjk,ji->cik", B, solution.inverse_gram)
-    weight = np.diagonal(solution.weights, axis1=1, axis2=2)
+    weight = np.diagonal(solution.residual_weights, axis1=1, axis2=2)
     part = (
         np.einsum("cik,bkm,cim->bci", half, record.moments, half, optimize=True) * weight[..., None]
     )
-    part = levels.sums_over_groups(part).reshape(-1, NUM_PARAMETERS)
+    part = levels.sums_over_groups(part).reshape(-1, NUM_RIGID_PARAMETERS)
     share = part / np.maximum(part.sum(axis=0), 1e-300)
-    freedom = np.repeat(2.0 * levels.sums_over_groups(levels.sizes), 6)
+    freedom = np.repeat(2.0 * levels.sums_over_groups(levels.band_sizes), 6)
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
@@ -260,23 +262,23 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and e (6, 38): coefficients of 38 signals in the residual."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
-    B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
+    B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
         ahead, behind = (
             _motion_map_with_delay(replace(state, R_PS=_rotate_by_vector(state.R_PS, x * unit)))
-            for x in (_ROTATION_STEP_RAD, -_ROTATION_STEP_RAD)
+            for x in (_ROTATION_DIFFERENCE_STEP_RAD, -_ROTATION_DIFFERENCE_STEP_RAD)
         )
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_STEP_RAD)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_DIFFERENCE_STEP_RAD)
     return B, L @ M
 
 
 def _normal_equations(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
-    columns = B.reshape(-1, MOMENTS_SIZE)
-    BZ = (columns @ Z).reshape(len(Z), 6, NUM_PARAMETERS, MOMENTS_SIZE)
+    columns = B.reshape(-1, NUM_MOMENT_SIGNALS)
+    BZ = (columns @ Z).reshape(len(Z), 6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS)
     WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
     gram = np.einsum("dbjk,dik->ji", WB, B, optimize=True)
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
@@ -289,7 +291,7 @@ def _inverse_of_free_parameters(
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = values > _RANK_TOLERANCE * values[-1]
+    kept = values > _MIN_RELATIVE_GRAM_EIGENVALUE * values[-1]
     basis = scale[:, None] * vectors[:, kept]
     null = np.sum(vectors[:, ~kept] ** 2, axis=1) > 1e-6
     return (basis / values[kept]) @ basis.T, free & (~used | null)
@@ -307,18 +309,18 @@ def _residual_channel_powers(record: _FitData, state: RigidParameters) -> Array:
 def _residual_covariances(
     record: _FitData, state: RigidParameters, sums: Array, used: Array | None = None
 ) -> Array:
-    levels, sizes = record.levels, record.levels.sizes[:, None]
+    levels, sizes = record.noise_levels, record.noise_levels.band_sizes[:, None]
     P = _residual_cross_powers(record.noise_moments, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _MIN_WRENCH_NOISE_SHARE * levels.noise_power(sums, used),
-        rounding_error_power(record.moments, levels.sizes),
+        _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(sums, used),
+        rounding_error_power(record.moments, levels.band_sizes),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 
-def _used_degrees_of_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+def _degrees_of_freedom_of_fit(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
     gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
@@ -326,28 +328,28 @@ def _used_degrees_of_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Ar
 
 
 def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array:
-    BF = (solution.derivative.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, WRENCH_COLUMNS]
-    BF = BF.reshape(len(Z), 6, NUM_PARAMETERS, 6)
-    return parameter_errors_by_gains(BF, solution.weights, solution.inverse_gram)
+    BF = (solution.residual_derivative.reshape(-1, NUM_MOMENT_SIGNALS) @ Z)[:, :, WRENCH_COLUMNS]
+    BF = BF.reshape(len(Z), 6, NUM_RIGID_PARAMETERS, 6)
+    return parameter_errors_by_gains(BF, solution.residual_weights, solution.inverse_gram)
 
 
-def _misfit_of_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
+def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
     if gain == 0.0:
         return 0.0
-    B, levels = solution.derivative, record.levels
+    B, levels = solution.residual_derivative, record.noise_levels
     effects = _parameter_errors_of_unit_gains(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
-    length = np.repeat([1.0, TORQUE_ARM_M], 3)
-    left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
+    length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
+    left = left.reshape(6, 6, 6, NUM_MOMENT_SIGNALS)  # of channel c by gain d, k
     for c in range(6):
         left[c, c, :, WRENCH_COLUMNS] += np.diag(length[c] / length)
-    left = left.reshape(6, 36, MOMENTS_SIZE)
+    left = left.reshape(6, 36, NUM_MOMENT_SIGNALS)
     sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.moments, left, optimize=True)
-    more = levels.noise_power(np.maximum(sums, 0.0)) / record.power
+    more = levels.noise_power(np.maximum(sums, 0.0)) / record.linear_noise_power
     return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 
 
-def _apply_step(state: RigidParameters, step: Array) -> RigidParameters:
+def _add_rigid_step(state: RigidParameters, step: Array) -> RigidParameters:
     return RigidParameters(
         state.theta + step[OFFSET_AND_LOAD_PARAMETERS],
         state.delay_s + float(step[16]),
@@ -369,22 +371,22 @@ class UnitsAndAxes:
 
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
-        position_unit_deviation: its standard deviation; inf if undetermined.
-        max_mass_deviation_kg: largest standard deviation of M_g (3, 3), force over minus gravity.
+        position_unit_ratio_std: its standard deviation; inf if undetermined.
+        max_mass_std_kg: largest standard deviation of M_g (3, 3), force over minus gravity.
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         axis_masses_kg: (3,) singular values of M_g [kg].
     """
 
     position_unit_ratio: float
-    position_unit_deviation: float
-    max_mass_deviation_kg: float
+    position_unit_ratio_std: float
+    max_mass_std_kg: float
     R_SP: Array
     axis_masses_kg: Array
 
     @property
     def is_usable(self) -> bool:
         """Whether M_g, force over minus gravity, is known to 5 % of the mass."""
-        return bool(self.max_mass_deviation_kg < 0.05 * self.axis_masses_kg.mean())
+        return bool(self.max_mass_std_kg < 0.05 * self.axis_masses_kg.mean())
 
     @property
     def is_mirrored(self) -> bool:

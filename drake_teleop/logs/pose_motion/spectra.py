@@ -15,7 +15,7 @@ from drake_teleop.load.moments import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
     NUM_MOTION_SIGNALS,
     PoseSplines,
-    passed_noise_share,
+    noise_share_passed_by_splines,
 )
 
 ComplexArray = NDArray[np.complex128]
@@ -28,13 +28,13 @@ EXCLUSION_RAMP_S = 0.2
 """Length of the taper's ramps beside excluded samples [s]."""
 _GRID_RATE_HZ = 100.0
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
-_MIN_GROUP_SIZE = 8.0
+_MIN_NOISE_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
-_NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
+_NARROW_BANDS_TO_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
 WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
 """Columns of the wrench and of the signals' derivatives in the moments."""
 SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, 2 * NUM_MOTION_SIGNALS + 6)
-MOMENTS_SIZE = 2 * NUM_MOTION_SIGNALS + 6
+NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,29 +77,29 @@ class FrequencyBands:
     """Frequency bands, which form groups with a common noise level.
 
     Attributes:
-        frequency, band: (K,) used frequencies [Hz], and their bands.
-        weight: (K,) half the number of independent values at each frequency.
-        group: (count,) group of each band.
+        frequency, band_of_frequency: (K,) used frequencies [Hz], and their bands.
+        frequency_weight: (K,) half the number of independent values at each frequency.
+        group_of_band: (num_bands,) group of each band.
     """
 
     frequency: Array
-    band: NDArray[np.intp]
-    weight: Array
-    group: NDArray[np.intp]
+    band_of_frequency: NDArray[np.intp]
+    frequency_weight: Array
+    group_of_band: NDArray[np.intp]
 
     @property
-    def count(self) -> int:
-        return int(self.band[-1]) + 1
+    def num_bands(self) -> int:
+        return int(self.band_of_frequency[-1]) + 1
 
     @cached_property
-    def sizes(self) -> Array:
-        """Half the number of independent values (count,) in each band."""
-        return np.asarray(np.bincount(self.band, self.weight), np.float64)
+    def band_sizes(self) -> Array:
+        """Half the number of independent values (num_bands,) in each band."""
+        return np.asarray(np.bincount(self.band_of_frequency, self.frequency_weight), np.float64)
 
     def sums_over_bands(self, values: Array) -> Array:
-        flat = values.reshape(len(values), -1) * self.weight[:, None]
-        starts = np.searchsorted(self.band, np.arange(self.count))
-        return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
+        flat = values.reshape(len(values), -1) * self.frequency_weight[:, None]
+        starts = np.searchsorted(self.band_of_frequency, np.arange(self.num_bands))
+        return np.add.reduceat(flat, starts, axis=0).reshape(self.num_bands, *values.shape[1:])
 
 
 def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
@@ -110,13 +110,13 @@ def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> Frequenc
     weight[0] *= 0.5
     group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
     for k in range(len(_GROUP_EDGES_HZ)):
-        if 0.0 < weight[group == k].sum() < _MIN_GROUP_SIZE:
+        if 0.0 < weight[group == k].sum() < _MIN_NOISE_GROUP_SIZE:
             group[group == k] = k + 1
     last = group == group[-1]
-    if weight[last].sum() < _MIN_GROUP_SIZE and not last.all():
+    if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
         group[last] = group[~last][-1]
-    narrow = np.log(np.clip(frequency, frequency[1], _NARROW_BELOW_HZ) / frequency[1]) // np.log(
-        _MAX_BAND_RATIO
+    narrow = np.log(np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]) // np.log(
+        _MAX_NARROW_BAND_EDGE_RATIO
     )
     first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
     group = np.unique(group[first], return_inverse=True)[1]
@@ -134,11 +134,11 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance_to_flag(lost) * dt - margin) / EXCLUSION_RAMP_S, 0.0, 1.0)
+    edge = np.clip((instants_to_nearest_flag(lost) * dt - margin) / EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
-def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
+def instants_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
     """Return the number (M,) of instants to the nearest set flag; inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
@@ -200,10 +200,10 @@ def second_moments(
     They are sums of Re y* y^T; (bands, 22, 22) without `rates`, the spectra of d zeta/dt.
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
-    y = np.hstack(parts) * np.sqrt(bands.weight)[:, None]
-    starts = np.searchsorted(bands.band, np.arange(bands.count + 1))
-    out = np.empty((bands.count, y.shape[1], y.shape[1]))
-    for k in range(bands.count):
+    y = np.hstack(parts) * np.sqrt(bands.frequency_weight)[:, None]
+    starts = np.searchsorted(bands.band_of_frequency, np.arange(bands.num_bands + 1))
+    out = np.empty((bands.num_bands, y.shape[1], y.shape[1]))
+    for k in range(bands.num_bands):
         # Real and imaginary parts as rows need only one real product per band.
         part = y[starts[k] : starts[k + 1]].view(np.float64).reshape(-1, y.shape[1], 2)
         part = part.transpose(0, 2, 1).reshape(-1, y.shape[1])
@@ -211,7 +211,7 @@ def second_moments(
     return out
 
 
-_MIN_REMAINING_DEGREES_SHARE = 0.25
+_MIN_REMAINING_DOF_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,49 +219,53 @@ class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
-        sizes, group: (bands,) half the number of independent values in each band, and its group.
-        shape: (bands, 6) power relative to the level.
+        band_sizes: (bands,) half the number of independent values in each band.
+        group_of_band: (bands,) group of each band.
+        relative_power: (bands, 6) power relative to the level.
     """
 
-    sizes: Array
-    group: NDArray[np.intp]
-    shape: Array
+    band_sizes: Array
+    group_of_band: NDArray[np.intp]
+    relative_power: Array
 
     @classmethod
     def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
         """Return levels of noise that is white within each group of bands."""
-        return cls(bands.sizes, bands.group, np.ones((bands.count, 6)))
+        return cls(bands.band_sizes, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """
-        remaining = self.sums_over_groups(self.sizes)[:, None]
+        remaining = self.sums_over_groups(self.band_sizes)[:, None]
         if used is not None:
             remaining = np.maximum(
                 remaining - 0.5 * self.sums_over_groups(used),
-                _MIN_REMAINING_DEGREES_SHARE * remaining,
+                _MIN_REMAINING_DOF_SHARE * remaining,
             )
-        level = np.add.reduceat(sums / self.shape, self._first_bands_of_groups, axis=-2) / remaining
-        return np.asarray(level[..., self.group, :] * self.shape)
+        level = (
+            np.add.reduceat(sums / self.relative_power, self._first_bands_of_groups, axis=-2)
+            / remaining
+        )
+        return np.asarray(level[..., self.group_of_band, :] * self.relative_power)
 
     def sums_over_groups(self, x: Array) -> Array:
         return np.asarray(np.add.reduceat(x, self._first_bands_of_groups, axis=0))
 
     @cached_property
     def _first_bands_of_groups(self) -> NDArray[np.intp]:
-        return np.flatnonzero(np.diff(self.group, prepend=-1))
+        return np.flatnonzero(np.diff(self.group_of_band, prepend=-1))
 
     def negative_log_likelihoods(self, power: Array) -> Array:
         """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""
-        return np.asarray(self.sizes @ np.log(power))
+        return np.asarray(self.band_sizes @ np.log(power))
 
 
-def random_walk_shape(bands: FrequencyBands, corner: float) -> Array:
+def random_walk_relative_power(bands: FrequencyBands, corner: float) -> Array:
     """Return the mean (bands,) of 1 + (corner / f)^2 in each band, Eq. (T74)."""
     f = np.maximum(bands.frequency, bands.frequency[1])
-    return np.asarray(1.0 + bands.sums_over_bands((corner / f) ** 2) / bands.sizes)
+    return np.asarray(1.0 + bands.sums_over_bands((corner / f) ** 2) / bands.band_sizes)
 
 
 OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
@@ -283,10 +287,10 @@ def noise_moments(
     """
     w2 = (2.0 * np.pi * bands.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
-    share = per_number * passed_noise_share(bands.frequency, splines.spacing)
+    share = per_number * noise_share_passed_by_splines(bands.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
-        left = splines.imu_rows.remaining_noise_shares(bands.frequency)
+        left = splines.imu_rows.pose_noise_shares_left_by_imu(bands.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
     still, first, second, third = _signal_covariances_by_rotation(zeta, weight)
@@ -298,7 +302,7 @@ def noise_moments(
         (rotation_power * w2, first + second),
     ]
     parts.append((rotation_power * w2**2, third))
-    Q = np.zeros((bands.count, MOMENTS_SIZE, MOMENTS_SIZE))
+    Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
     for power, shape in parts:
         Q[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS] += (
             bands.sums_over_bands(power)[:, None, None] * shape

@@ -19,12 +19,12 @@ MIN_POSES_PER_KNOT = 2.0
 """Least average number of poses between two knots."""
 NUM_MOTION_SIGNALS = 16
 """Number of columns of `PoseSplines.signals`."""
-GRAVITY_COLUMNS, COLUMNS_ZERO_AT_REST = slice(4, 7), [1, 2, 3, *range(7, 16)]
+GRAVITY_COLUMNS, SIGNALS_ZERO_AT_REST = slice(4, 7), [1, 2, 3, *range(7, 16)]
 """Columns of gravity, and columns that are zero at rest."""
 # Frequency times h where the residual is noise: just above the passed frequencies.
-_NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
-_CHUNK_ROWS = 2**17
-_LIMITED_DERIVATIVES = range(1, 5)  # of derivatives at the ends
+_POSE_NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
+_MAX_ROWS_PER_BLOCK = 2**17
+_DERIVATIVES_LIMITED_AT_ENDS = range(1, 5)  # of derivatives at the ends
 # Largest weight of the penalty or of a limit over that of the poses; rounding allows no more.
 _MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
@@ -36,18 +36,18 @@ class ImuSplineRows:
     Attributes:
         acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
         quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
-        pose_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
-        imu_powers: noise power densities of acceleration and angular velocity.
+        pose_noise_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
+        imu_noise_powers: noise power densities of acceleration and angular velocity.
     """
 
     t: Array
     rate: float
-    pose_powers: tuple[float, float]
-    imu_powers: tuple[float, float]
+    pose_noise_powers: tuple[float, float]
+    imu_noise_powers: tuple[float, float]
     acceleration_W: Array | None = None
     quaternion_rate: Array | None = None
 
-    def from_sensor_axes(
+    def with_data_in_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
         """Return rows with specific force s and omega (K, 3), rotated from S by `splines`."""
@@ -55,20 +55,20 @@ class ImuSplineRows:
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
         if s is not None:
-            acceleration = _rotate_to_P(q * (1.0, -1.0, -1.0, -1.0), n, s) + gravity_W
+            acceleration = _rotate_W_to_P(q * (1.0, -1.0, -1.0, -1.0), n, s) + gravity_W
         if omega is not None:
             w, v = q[:, :1], q[:, 1:]
             real = -np.sum(v * omega, axis=1, keepdims=True)
             rates = 0.5 * np.hstack([real, w * omega + _cross_products(v, omega)])
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
-    def remaining_noise_shares(self, frequency: Array) -> tuple[Array, Array]:
+    def pose_noise_shares_left_by_imu(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
-            self.pose_powers,
-            self.imu_powers,
+            self.pose_noise_powers,
+            self.imu_noise_powers,
             (4, 2),
             (self.acceleration_W, self.quaternion_rate),
             strict=True,
@@ -98,12 +98,12 @@ class PoseSplines:
         self._smooth = smooth
         self._start = float(poses.t[0])
         t = poses.t - self._start
-        self._blocks = _row_blocks(len(t))
-        knots = _knots(t, spacing, with_imu=imu_rows is not None)
+        self._blocks = _split_rows_into_blocks(len(t))
+        knots = _place_knots(t, spacing, with_imu=imu_rows is not None)
         try:
             self._spline = self._fit_spline(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
-            self._spline = self._fit_spline(t, _thin_knots(knots, t))
+            self._spline = self._fit_spline(t, _remove_knots_without_poses(knots, t))
 
     def _fit_spline(self, t: Array, knots: Array) -> BSpline:
         poses, imu_rows = self.poses, self.imu_rows
@@ -123,8 +123,8 @@ class PoseSplines:
             (slice(0, 3), slice(3, 7)),
             (2, 1),
             (imu_rows.acceleration_W, imu_rows.quaternion_rate),
-            imu_rows.pose_powers,
-            imu_rows.imu_powers,
+            imu_rows.pose_noise_powers,
+            imu_rows.imu_noise_powers,
             strict=True,
         ):
             band, side = gram, right[:, part]
@@ -141,8 +141,8 @@ class PoseSplines:
         values = np.hstack([self.poses.position, self.poses.quaternion])
         A = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
         root = diags_array(np.sqrt(np.diff(knots[SPLINE_DEGREE:-SPLINE_DEGREE])))
-        root = root @ _derivative_map(knots, SPLINE_DEGREE)
-        penalty = _upper_band((root.T @ root).tocsr())
+        root = root @ _derivative_coefficients_matrix(knots, SPLINE_DEGREE)
+        penalty = _upper_band_of_gram((root.T @ root).tocsr())
         largest = _MAX_PENALTY_OVER_POSE_WEIGHT * gram[-1].max()
         lowest = (self.rate * penalty[-1].max() / largest) ** (0.5 / SPLINE_DEGREE) / (2 * np.pi)
         coefficients = np.empty_like(right)
@@ -177,14 +177,14 @@ class PoseSplines:
         inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
         if not len(inside):
             return
-        x = np.stack([spline(inside, order) for order in _LIMITED_DERIVATIVES])
+        x = np.stack([spline(inside, order) for order in _DERIVATIVES_LIMITED_AT_ENDS])
         covariance = np.einsum("inc,jnc->ij", x, x) / (x.shape[1] * x.shape[2])
         std = np.sqrt(np.diag(covariance)) + 1e-150
         correlation = covariance / np.outer(std, std) + 1e-6 * np.eye(len(std))
         weight = noise * np.linalg.inv(correlation) / np.outer(std, std)
         for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
             basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
-            values = np.stack([basis(at, order) for order in _LIMITED_DERIVATIVES])
+            values = np.stack([basis(at, order) for order in _DERIVATIVES_LIMITED_AT_ENDS])
             limit = values.T @ weight @ values
             # Constant poses have no derivatives inside; their limit would exceed all poses.
             limit *= min(1.0, largest / np.trace(limit))
@@ -225,15 +225,15 @@ class PoseSplines:
     def gravity(self, t: Array, gravity_W: Array) -> Array:
         """Return gravity (N, 3) at times t, in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
-        for part in _row_blocks(len(t)):
+        for part in _split_rows_into_blocks(len(t)):
             q = self.quaternion(t[part])
             gravity_rows = np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _rotate_to_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
+            out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
         return out
 
     def _motion_in_blocks(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         out = np.empty((4, len(t), 3))
-        for part in _row_blocks(len(t)):
+        for part in _split_rows_into_blocks(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 
@@ -247,12 +247,12 @@ class PoseSplines:
             - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
         )
         gravity_rows = np.broadcast_to(-gravity_W, (len(t), 3))
-        return _rotate_to_P(q, n, second[:, :3]), _rotate_to_P(q, n, gravity_rows), omega, alpha
+        return _rotate_W_to_P(q, n, second[:, :3]), _rotate_W_to_P(q, n, gravity_rows), omega, alpha
 
     def estimate_pose_noise(self) -> tuple[float, float]:
         """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""
         if self.imu_rows is not None:
-            position_power, rotation_power = self.imu_rows.pose_powers
+            position_power, rotation_power = self.imu_rows.pose_noise_powers
             return float(np.sqrt(position_power * self.rate)), float(
                 np.sqrt(rotation_power * self.rate)
             )
@@ -271,7 +271,7 @@ class PoseSplines:
     def _powers_in_noise_band(self, residual: Array) -> Array:
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
-        low, high = (share / self.spacing for share in _NOISE_BAND_OVER_KNOT_RATE)
+        low, high = (share / self.spacing for share in _POSE_NOISE_BAND_OVER_KNOT_RATE)
         inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
         return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
@@ -294,14 +294,14 @@ class SplineCache:
         return self._splines_by_spacing[spacing]
 
 
-def passed_noise_share(frequency: Array, spacing: float) -> Array:
+def noise_share_passed_by_splines(frequency: Array, spacing: float) -> Array:
     """Return the share (K,) of noise power that splines pass at frequencies [Hz], Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (SPLINE_DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
-def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
+def _place_knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
     if with_imu:
         return np.concatenate(
@@ -314,7 +314,7 @@ def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     return np.concatenate([ends[: SPLINE_DEGREE + 1], inner, ends[SPLINE_DEGREE + 1 :]])
 
 
-def _thin_knots(knots: Array, t: Array) -> Array:
+def _remove_knots_without_poses(knots: Array, t: Array) -> Array:
     inner, kept, last = knots[SPLINE_DEGREE + 1 : -SPLINE_DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
         if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:
@@ -323,8 +323,8 @@ def _thin_knots(knots: Array, t: Array) -> Array:
     return np.concatenate([knots[: SPLINE_DEGREE + 1], kept, knots[-SPLINE_DEGREE - 1 :]])
 
 
-def _row_blocks(count: int) -> list[slice]:
-    return [slice(k, k + _CHUNK_ROWS) for k in range(0, count, _CHUNK_ROWS)]
+def _split_rows_into_blocks(count: int) -> list[slice]:
+    return [slice(k, k + _MAX_ROWS_PER_BLOCK) for k in range(0, count, _MAX_ROWS_PER_BLOCK)]
 
 
 def _spline_normal_equations(
@@ -348,18 +348,18 @@ def _spline_normal_equations(
 
 
 def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    change = _derivative_map(knots, order)
-    degree, parts = SPLINE_DEGREE - order, _row_blocks(len(t))
+    change = _derivative_coefficients_matrix(knots, order)
+    degree, parts = SPLINE_DEGREE - order, _split_rows_into_blocks(len(t))
     inner = knots[order : len(knots) - order]
     band, right = _spline_normal_equations(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
     upper = diags_array(
         [band[degree - k, k:] for k in range(degree + 1)], offsets=list(range(degree + 1))
     ).tocsr()
     gram = change.T @ (upper + upper.T - diags_array(band[degree])) @ change
-    return _upper_band(gram.tocsr()), change.T @ right
+    return _upper_band_of_gram(gram.tocsr()), change.T @ right
 
 
-def _derivative_map(knots: Array, order: int) -> csr_array:
+def _derivative_coefficients_matrix(knots: Array, order: int) -> csr_array:
     """Return the matrix from coefficients of a spline to those of its derivative."""
     change = eye_array(len(knots) - SPLINE_DEGREE - 1, format="csr")
     for k in range(order):
@@ -371,7 +371,7 @@ def _derivative_map(knots: Array, order: int) -> csr_array:
     return change
 
 
-def _upper_band(gram: csr_array) -> Array:
+def _upper_band_of_gram(gram: csr_array) -> Array:
     out = np.zeros((SPLINE_DEGREE + 1, gram.shape[0]))
     for k in range(SPLINE_DEGREE + 1):
         out[SPLINE_DEGREE - k, k:] = gram.diagonal(k)
@@ -384,7 +384,7 @@ def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
     return out
 
 
-def _rotate_to_P(q: Array, n: Array, x: Array) -> Array:
+def _rotate_W_to_P(q: Array, n: Array, x: Array) -> Array:
     v = -q[:, 1:]
     once = _cross_products(v, x)
     out: Array = x + 2.0 * (q[:, :1] * once + _cross_products(v, once)) / n

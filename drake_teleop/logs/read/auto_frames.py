@@ -172,14 +172,14 @@ def estimate_auto_pose_frame(
             frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
         )
         changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
-        deviation = 1e3 * float(frame.position_deviations_m.max())
+        deviation = 1e3 * float(frame.position_stds_m.max())
         notes.append(_pose_frame_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
     if pose.rotation_in_sensor == "auto":
         _require_determined_axes(
             frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
         )
         changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
-        deviation = float(frame.rotation_deviations_deg.max())
+        deviation = float(frame.rotation_stds_deg.max())
         notes.append(_pose_frame_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import (
-    NUM_COLUMNS_OF_FORM,
+    NUM_COLUMNS_OF_ROTATION_FORM,
     nearest_rotation,
     orthogonality_error,
     quaternions_from_matrices,
@@ -103,7 +103,7 @@ class OrientationColumns:
         where: str,
     ) -> None:
         self._orientation, self._table, self._where = orientation, table, where
-        width = NUM_COLUMNS_OF_FORM[orientation.form]
+        width = NUM_COLUMNS_OF_ROTATION_FORM[orientation.form]
         self._columns = table.finite_numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
             self._columns *= description.unit_in_si(orientation.unit)

@@ -13,7 +13,7 @@ from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import FLAG_INDEX, ContactDetector, update_contact_flag
-from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_MARGIN, NoiseFloor
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_OVER_MAX, NoiseFloor
 from drake_teleop.load.regressor import (
     FIRST_JOINT_INDEX,
     SAMPLE_ANGULAR_ACCELERATION,
@@ -34,7 +34,7 @@ class ContactDetectionConfig:
 
     statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        THRESHOLD_MARGIN,
+        THRESHOLD_OVER_MAX,
         "1",
         1.0,
         10.0,

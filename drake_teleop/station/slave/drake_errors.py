@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError, silent_stderr
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError, silent_stderr
 
 #: Expected kind of file, and the remedy for missing packages.
 ModelErrorTexts: TypeAlias = tuple[str, str]
@@ -43,7 +43,11 @@ def translate_drake_errors(
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
-        room = MAX_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_SEPARATOR_CHARS_IN_ERROR_LINE
+        room = (
+            MAX_ERROR_LINE_LENGTH
+            - len(f"{path}{what}{remedy}")
+            - _NUM_SEPARATOR_CHARS_IN_ERROR_LINE
+        )
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None

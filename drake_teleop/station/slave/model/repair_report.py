@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
+from drake_teleop.common.errors import MAX_ERROR_LINE_LENGTH, DrakeTeleopError
 
 _MAX_JOINED_NAMES = 12  # names in one statement
 
@@ -65,7 +65,7 @@ class RepairReport:
         causes = list(self._causes)
         if len(causes) == 1:
             raise DrakeTeleopError(causes[0], where=str(file))
-        room = MAX_LINE_LENGTH - len(f"{file}: the model has 1000 faults: ; and 1000 more")
+        room = MAX_ERROR_LINE_LENGTH - len(f"{file}: the model has 1000 faults: ; and 1000 more")
         texts = list[str]()
         for k, cause in enumerate(causes, start=1):
             texts.append(f"({k}) {cause}")
