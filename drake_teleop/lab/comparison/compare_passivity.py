@@ -83,7 +83,7 @@ def compare_command(
     """Compare the given methods, or all; write summary, runs, report and pictures into `out`.
 
     Rates, integrator and environment of the scenario are not used. Return the content of
-    summary.json (docs/delay.md).
+    summary.json (docs/delay-figures.md).
     """
     for name in networks:
         if name not in PRESETS:
