@@ -1,4 +1,4 @@
-"""Scenarios of a live session: scenes of the page, and changes by the driver's choices."""
+"""Scenarios of a live session: those of the web page's scenes, changed by the user's choices."""
 
 from __future__ import annotations
 

@@ -101,7 +101,11 @@ class FourierTrajectory:
         except DrakeTeleopError:
             raise
         except (AttributeError, TypeError, ValueError) as error:
-            raise DrakeTeleopError(f"is not a trajectory ({error})", where=str(path)) from None
+            raise DrakeTeleopError(
+                f"is not a trajectory ({error})",
+                where=str(path),
+                remedy="give each joint one q0, and one rho and delta per harmonic",
+            ) from None
         shapes_fit = q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
         if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):

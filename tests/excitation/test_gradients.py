@@ -250,7 +250,7 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.array([next(numbers)]),
         evaluate=lambda x, *sharpness: SimpleNamespace(
-            log_criterion=0.01 * x[0], uses=np.full(2, uses.get(x[0], 0.9))
+            log_criterion=0.01 * x[0], smooth_limit_uses=np.full(2, uses.get(x[0], 0.9))
         ),
     )
     search = _DescentSearch(problem, 1, None, lambda *_: None)

@@ -213,7 +213,7 @@ def test_wrench_is_used_if_it_determines_more_coordinates_than_the_pose(
         for known, source in ((2, "pose"), (of_wrench, "wrench"))
     )
     monkeypatch.setattr(auto_frames, "lever_arm_from_wrench", lambda _: other)
-    of_the_pose: Any = SimpleNamespace(fits_pose=True, lever=of_pose)
+    of_the_pose: Any = SimpleNamespace(fits_pose=True, lever_arm=of_pose)
     if taken == "wrench":
         assert auto_frames._lever_arm_from_pose_or_wrench(of_the_pose, None, "here") is other
         return

@@ -151,7 +151,7 @@ def measure_frequency_response(
     spectra: dict[str, Complex] = {
         name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, odd_multiples]
         * (2 / steps)
-        for name, signal in _project_signals_on_task(result, scenario, task).items()
+        for name, signal in _forces_and_velocities_along_task(result, scenario, task).items()
     }
     return StationResponse(
         np.asarray(2 * np.pi / excitation.period * odd_multiples, dtype=float),
@@ -160,7 +160,7 @@ def measure_frequency_response(
     )
 
 
-def _project_signals_on_task(
+def _forces_and_velocities_along_task(
     result: SimulationResult, scenario: Scenario, task: TaskDirection
 ) -> dict[str, Array]:
     arm, states = NominalSlave(scenario.slave).arm, result["slave_state"]

@@ -79,7 +79,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
                 state, "gravity", [start_parameters_of_tilt_fit(state), None], _is_tilt_significant
             )
         if "weight" not in model.extensions and data.accelerates_enough:
-            yield from _fit_extension(state, "weight", [None], _is_weight_significant)
+            yield from _fit_extension(state, "weight", [None], _is_removed_weight_large)
     if "torque factor" not in model.extensions and data.accelerates_enough:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
@@ -223,7 +223,7 @@ def _extension_magnitude(state: State, name: str) -> float:
     return float(np.linalg.norm(state.parameters_of_extension(name)[0]))
 
 
-def _is_weight_significant(state: State) -> bool:
+def _is_removed_weight_large(state: State) -> bool:
     removed, _ = state.parameters_of_extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)

@@ -64,7 +64,7 @@ from drake_teleop.logs.read.reading import read_description
 
 # Episodes that determine load, lag and noise: fewer if they are long.
 _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
-_MAX_CALIBRATION_FRAMES = 12_000
+_MAX_CALIBRATION_ROWS = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
 _MAX_UNEXPLAINED_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
@@ -275,7 +275,7 @@ def _estimate_shared_load(
 ) -> SharedLoad:
     frames = max(np.median([episode.rows for episode in dataset.episodes]), 1)
     count = np.clip(
-        _MAX_CALIBRATION_FRAMES // frames, _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES
+        _MAX_CALIBRATION_ROWS // frames, _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES
     )
     step = -(-len(dataset.episodes) // int(count))
     logs, errors = [], []

@@ -1,4 +1,4 @@
-"""Load that most episodes of a dataset share, with offsets, lag and noise of the episodes."""
+"""Load that most episodes of a dataset share, and their usual offsets, lag and noise."""
 
 from __future__ import annotations
 

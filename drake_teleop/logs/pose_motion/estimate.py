@@ -53,7 +53,7 @@ MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG = 5.0, 1.0
 """Least rotation that is reported, and largest standard deviation of a known one [deg]."""
-_MIN_FRAME_CHANGE_WALD_STATISTIC, _MIN_FRAME_CHANGE_OVER_STD = 50.0, 5.0
+_MIN_FRAME_ERROR_WALD_STATISTIC, _MIN_FRAME_ERROR_OVER_STD = 50.0, 5.0
 _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
@@ -363,25 +363,25 @@ def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
     limits = np.radians([MIN_REPORTED_FRAME_ROTATION_DEG, MAX_KNOWN_FRAME_ROTATION_STD_DEG])
-    shifted = _is_frame_moved(
+    shifted = _is_frame_wrong(
         moved, covariance[:3, :3], MIN_REPORTED_FRAME_SHIFT_M, MAX_KNOWN_FRAME_SHIFT_STD_M
     )
-    tilted = _is_frame_moved(turned, covariance[3:, 3:], *limits)
+    tilted = _is_frame_wrong(turned, covariance[3:, 3:], *limits)
     return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,
         position_stds_m=deviations,
         rotation_stds_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
-        is_shifted=bool(wald > _MIN_FRAME_CHANGE_WALD_STATISTIC and shifted),
-        is_rotated=bool(wald > _MIN_FRAME_CHANGE_WALD_STATISTIC and tilted),
+        is_shifted=bool(wald > _MIN_FRAME_ERROR_WALD_STATISTIC and shifted),
+        is_rotated=bool(wald > _MIN_FRAME_ERROR_WALD_STATISTIC and tilted),
     )
 
 
-def _is_frame_moved(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
+def _is_frame_wrong(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)
     direction = x / (length + 1e-300)
     deviation = float(np.sqrt(direction @ covariance @ direction))
-    significant = length > max(least, _MIN_FRAME_CHANGE_OVER_STD * deviation)
+    significant = length > max(least, _MIN_FRAME_ERROR_OVER_STD * deviation)
     return bool(significant and deviation < largest_deviation)

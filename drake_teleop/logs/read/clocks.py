@@ -53,7 +53,7 @@ class Clock:
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
     """Return checked and corrected times of a stream's rows.
 
-    A row with the same values in all `columns` as the previous row is a repetition.
+    A row that repeats the time stamp and the values in `columns` of the previous row is removed.
     """
     if time.column is None:
         assert time.rate is not None
