@@ -50,6 +50,9 @@ EXPLAINED = {
     # A module of the package by its name.
     ("cli/printing.py", "import_module"),
     ("__init__.py", "import_module"),
+    ("robots/connections.py", "import_module"),
+    # polars, on a thread of its own.
+    ("live/record.py", "import_module"),
     # The Python file that the user names with --register.
     ("common/registry.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
@@ -111,8 +114,7 @@ WRITING = {
     ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `whole_file`; and a dataset that the package generates.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
-    ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
-    ("logs/dataset/dataset_files.py", ".write_bytes"),
+    ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_bytes"),
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked

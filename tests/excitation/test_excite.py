@@ -770,7 +770,7 @@ from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
 limits = RobotFromModel(Path({str(model)!r}), "l3", WristSensorConfig()).limits
-print(len(limits.capsule_radius), len(limits.pairs))
+print(len(limits.capsule_radius), len(limits.capsule_pairs))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout.split()) == (0, ["6", "0"])

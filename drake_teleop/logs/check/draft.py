@@ -85,7 +85,7 @@ _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_MEDIAN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN_TEXT = "FILL IN"
-_TIME_STAMP_FIELDS = ("column", "nanoseconds")
+_STAMP_FIELDS = ("column", "nanoseconds")
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
@@ -196,7 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
     times = {
-        stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_STAMP_FIELDS
+        stream.get("time", {}).get(name) for stream in draft.values() for name in _STAMP_FIELDS
     }
     used |= times - {None}
     arrays = _names_of_array_columns(table)
@@ -238,9 +238,7 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _group_numbered_columns(
-    plain: dict[str, tuple[str, str]], pattern: str
-) -> dict[str, list[str]]:
+def _numbered_columns(plain: dict[str, tuple[str, str]], pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(pattern, words):
@@ -287,7 +285,7 @@ def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[s
 
 
 def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
+    groups = _numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
@@ -303,14 +301,14 @@ def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
 
 
 def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
+    groups = _numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
     return {"orientation": _UnitColumns(found, "")} if found else {}
 
 
 def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    groups = _group_numbered_columns(plain, r"\d$")
+    groups = _numbered_columns(plain, r"\d$")
     found: dict[str, _UnitColumns] = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)

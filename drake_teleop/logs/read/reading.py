@@ -1,4 +1,4 @@
-"""Conversion of a canonical table or a described recording into a `Log`."""
+"""Conversion of a canonical table or a described recording into a `Log` (long: one class)."""
 
 from __future__ import annotations
 
@@ -361,14 +361,12 @@ class _LogReader:
         )
 
     def _quantization_steps(self, stream: Static, table: Table) -> tuple[float, float]:
-        force, torque = (
-            decimal_resolution(
-                table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
-            )
-            * (self._description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max())
-            for field, quantity in (("force", stream.force), ("torque", stream.torque))
-        )
-        return force, torque
+        steps = []
+        for field, quantity in (("force", stream.force), ("torque", stream.torque)):
+            values = table.finite_numbers(quantity.columns, 3, f"static.{field}", table.rows)
+            unit = self._description.unit_in_si(quantity.unit) * np.abs(quantity.scale).max()
+            steps.append(decimal_resolution(values) * unit)
+        return steps[0], steps[1]
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")

@@ -1,4 +1,4 @@
-"""Master's end of the passivity method "ledger", which balances energy at the slave's motion.
+"""Master's end of the passivity method "ledger" (long: one file for steps M1 to M7).
 
 docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
 """
