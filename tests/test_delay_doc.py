@@ -21,7 +21,7 @@ FIGURES = (ROOT / "docs" / "delay-figures.md").read_text(encoding="utf-8")
 
 def test_its_scenarios_load(tmp_path):
     blocks = re.findall("```yaml\n(.*?)```", TEXT, re.S)
-    assert len(blocks) == 2
+    assert len(blocks) == 1
     for k, block in enumerate(blocks):
         path = tmp_path / f"{k}.yaml"
         path.write_text(block)
