@@ -299,7 +299,7 @@ class Description(StrictModel):
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")
             return self
         if self.wrench is None:
-            raise ValueError("no wrench: add `wrench` (from any file), or only `static`")
+            raise ValueError("no wrench: add wrench (from any file), or only static (at rest)")
         if self.imu is None and self.pose is None:
             raise ValueError("a wrench without kinematics: add imu or pose (from any file)")
         if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
