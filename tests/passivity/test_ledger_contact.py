@@ -35,7 +35,6 @@ from drake_teleop.station.passivity.ledger_slave import (
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     LOAD_WRENCH,
-    RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
     WRENCH_LIMIT,
@@ -49,7 +48,6 @@ from drake_teleop.station.passivity.methods import (
     step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
-    CUMULATIVE_ENERGY,
     MAX_HAND_WRENCH_RATE,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
@@ -371,66 +369,6 @@ def test_slave_receives_the_pose_of_the_hand_without_flicker(step, axis):
     for _ in range(10):
         hand.step(np.abs(dx))
     assert hand.pose[axis] - hand.sent[POSE][axis] == pytest.approx(1.1 * step, rel=1e-6)
-
-
-@pytest.mark.parametrize(("level", "share"), [(0.5, 1.0), (0.9, 0.4), (0.975, 0.1)])
-def test_drag_in_contact_fades_as_the_ledger_fills(level, share):
-    """0.3 N of drag on a hand across a wall without friction, at 0.1 m/s."""
-    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0, drag=[0.3, 0.0])
-    hand.rest(1500)
-    reserve = RICH.ledger.hand_reserve[0]
-    for _ in range(40):
-        hand.memory[STORED_ENERGY][0] = level * reserve
-        drag = -hand.step([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])[0]
-    assert drag == pytest.approx(0.3 * share, rel=0.03)
-
-
-def test_reduced_wrench_recovers_within_a_second():
-    """A hand that is pushed back with an empty ledger, which is then filled."""
-    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.rest(1500)
-    for _ in range(20):
-        hand.memory[STORED_ENERGY][0] = 0.0
-        hand.step([0.0, 0.0, 1e-5, 0.0, 0.0, 0.0])
-    forces = []
-    for _ in range(1200):
-        hand.memory[STORED_ENERGY][0] = 0.05
-        forces.append(hand.step()[2])
-    assert forces[100] < 0.2 * forces[-1]
-    assert forces[500] == pytest.approx(0.5 * forces[-1], rel=0.1)
-    assert forces[1050] == pytest.approx(forces[-1], rel=1e-3)
-
-
-@pytest.mark.parametrize("stale_level", [0.0, -0.1])
-def test_slave_counts_energy_in_transit_to_the_hand(stale_level):
-    """The master's packets tell for 3 s nothing new: they do not contain what is on the way."""
-    p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
-    memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
-    received[POSE], received[PACKET_LEDGER_LEVEL] = START, stale_level
-    wrench, still = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), np.zeros(6)
-    memory[STORED_ENERGY], sent = 2.0, []
-    for _ in range(3000):
-        received[PACKET_NUMBER] += 1.0
-        slave_step(
-            step_addresses("ledger"), received, True, START, still, still, wrench, T, p, memory,
-            command, packet,
-        )  # fmt: skip
-        sent.append(memory[SENT_ENERGY][0])
-    own = RICH.ledger
-    needed = own.hand_reserve[0] + 0.7 * own.reserve[0] - stale_level
-    assert sent[-1] == pytest.approx(needed, rel=0.02)
-    assert sent[50] == pytest.approx((1.0 - np.exp(-1.0)) * needed, rel=0.05), "20 1/s"
-
-
-@pytest.mark.parametrize("received", [0.0, 0.05])
-def test_level_in_the_packet_of_the_hand_excludes_received_energy(received):
-    """The slave adds all that it has sent."""
-    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[CUMULATIVE_ENERGY] = received
-    hand.rest(1500)
-    levels = hand.sent[PACKET_LEDGER_LEVEL] + hand.memory[RECEIVED_ENERGY]
-    np.testing.assert_allclose(levels, hand.memory[STORED_ENERGY])
-    np.testing.assert_allclose(hand.memory[RECEIVED_ENERGY], received)
 
 
 @pytest.mark.parametrize("scale", [[1.0, 1.0], [3.0, 0.5]])

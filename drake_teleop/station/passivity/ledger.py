@@ -48,7 +48,6 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     LAST_WRENCH,
     MOTION_SCALE,
-    RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
     own_memory,
@@ -91,11 +90,10 @@ _HAND_INPUT_SENDING_LEVEL = 0.5  # of the master's reserve
 _UNUSED_MASTER_RESERVE_SHARE = 0.05  # of the master's reserve
 _MAX_LEDGER_DRAIN_RATE = 50.0  # 1/s
 _ZERO_FORCE_RETREAT_DISTANCE_M = 0.03
-_WITHHELD_WRENCH_RECOVERY_S = 1.0
+_WITHHELD_WRENCH_RECOVERY_S = 0.1
 _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
-_DRAG_FADE_LEVEL_RANGE = 0.25  # of the master's reserve
 _LOST_HAND_MOTION_ENCODER_STEPS = 1.1  # of the encoders
 _DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
@@ -223,7 +221,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         packet[CUMULATIVE_ENERGY][g], packet[PACKET_LEDGER_LEVEL][g] = (
             memory[SENT_ENERGY][g],
-            memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g],
+            memory[STORED_ENERGY][g],
         )
     copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
@@ -467,8 +465,6 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
         active[g] = 0.0
     if active[g] > 0.0:
         drag = p[DRAG_WRENCH][g]
-        if in_contact:
-            drag *= min((1.0 - own_level) / _DRAG_FADE_LEVEL_RANGE, 1.0)
     if speed < _FULL_DRAG_HAND_SPEED * ANGLE_PER_LENGTH[g]:
         memory[_WORK_ON_HAND_SINCE_REST][g] *= 1.0 - min(T / _FADE_TIME_AT_HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND_SINCE_REST][g] > 0.0:

@@ -61,7 +61,7 @@ _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1
 _MAX_SLAVE_ENERGY_IN_RESERVES = 4.0  # over the reserve
 _SLAVE_MEASUREMENT_FILTER_S = 3e-3
 _SLAVE_REST_SPEED = 0.05  # m/s
-_ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 20.0, 50.0  # 1/s
+_ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
 _LONGEST_DELAY_DECAY_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
 _HAND_PRESSING_SPEED = 0.06  # m/s
@@ -258,7 +258,7 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
     free, missing, returned = (
         ledger[g] - kinetic,
-        hold - _master_ledger_level(g, received, memory),
+        hold - received[PACKET_LEDGER_LEVEL][g],
         0.0,
     )
     needed = missing
@@ -281,12 +281,6 @@ def _servo_lag_s(p):
 
 
 @njit(cache=True)
-def _master_ledger_level(g, received, memory):
-    """Return the level of the master's ledger [J], with what is in transit to it."""
-    return received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]
-
-
-@njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
     depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
@@ -296,7 +290,7 @@ def _max_displayed_stiffness(received, T, p, memory):
             p[MASTER_RESERVE][g],
         )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
-        level = min(max(_master_ledger_level(g, received, memory) / reserve, 0.0), 1.0)
+        level = min(max(received[PACKET_LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
         _MAX_FEEDFORWARD_SILENCE_S, _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
