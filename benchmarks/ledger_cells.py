@@ -438,4 +438,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    import ledger_cells  # processes of `--jobs` find the functions by this name
+
+    sys.exit(ledger_cells.main())
