@@ -111,6 +111,15 @@ def test_no_energy_is_created_at_the_actual_motion(seed):
         assert run.wall.min() < -50.0, "the wall should have been hit"
 
 
+@pytest.mark.parametrize(("step", "known"), [(5.5e-5, 5.5e-5), (2e-4, 2e-4), (2e-4, 5e-5)])
+def test_no_energy_is_created_with_encoder_steps(step, known):
+    """Steps of the hand's encoder that the method knows, or that are larger than it knows."""
+    ledger = LedgerConfig(encoder_step=[known, 0.0])
+    run = hard_taps(1, PassivityConfig(method="ledger", ledger=ledger), master_resolution=step)
+    assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
+    assert run.wall.min() < -50.0, "the wall should have been hit"
+
+
 @pytest.mark.parametrize("delay", [5e-4, 0.15])
 def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
     """The fit of the bounces must not keep the motion alive."""
