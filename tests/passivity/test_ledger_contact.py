@@ -311,9 +311,11 @@ def test_released_hand_receives_at_most_its_ledger():
     assert 0.06 < got <= 0.02 + 0.7 * 0.1
 
 
-def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
+@pytest.mark.parametrize("known", [0.0, 3e-5])
+def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder(known):
     """A hand that oscillates by one encoder step needs a force on the way in as well."""
-    hand, got, step = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0), 0.0, 3e-5
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[known, 0.0])
+    got, step = 0.0, 3e-5
     hand.memory[STORED_ENERGY] = 0.0
     for k in range(600):
         way = step * ((k % 20 == 10) - float(k % 20 == 0))
@@ -330,8 +332,10 @@ def test_hand_at_the_border_of_two_encoder_steps_receives_a_constant_force(axis)
     changes = {}
     for known in (step, 0.0):
         steps = [known, 0.0] if axis < 3 else [0.0, known]
-        hand = Hand(np.array([0.4, 0.0, 3.0, 0.0, 0.02, 0.0]), 800.0, encoder_step=steps)
+        hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 800.0, encoder_step=steps)
         hand.rest(1500)
+        hand.packet[WRENCH][0], hand.packet[WRENCH][4] = 0.4, 0.02  # friction
+        hand.rest(200)
         for way in (0.0, 7.0, -4.0):
             dx = np.zeros(6)
             dx[axis] = way * step
@@ -376,6 +380,29 @@ def test_encoder_step_is_scaled_like_the_motion_of_the_hand(scale):
     config = PassivityConfig(method="ledger", ledger=LedgerConfig(encoder_step=[5e-5, 2e-3]))
     step = method_parameters(config, motion_scale=scale)[ENCODER_STEP]
     np.testing.assert_allclose(step, np.multiply(scale, [5e-5, 2e-3]))
+
+
+@pytest.mark.parametrize("known", [0.0, 3e-5, 3e-4])
+def test_balance_counts_the_measured_motion_within_the_lost_motion(known):
+    """A third of the reserve, which is not sent on: 3 N times each measured step."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[known, 0.0])
+    hand.rest(1500)
+    start = hand.memory[STORED_ENERGY][0] = RICH.ledger.hand_reserve[0] / 3
+    rng, work = np.random.default_rng(3), 0.0
+    for _ in range(200):
+        way = 3e-5 * rng.integers(-1, 2)
+        work += hand.felt[2] * way
+        hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
+        assert hand.memory[STORED_ENERGY][0] == pytest.approx(start - work)
+        assert hand.felt[2] > 1.0
+
+
+def test_energy_limit_counts_a_measured_step_within_the_lost_motion():
+    """0.3 mJ remain: a hand that was pushed back by a known step of 50 um receives less at once."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[5e-5, 0.0])
+    full = hand.rest(1500)[2]
+    hand.memory[STORED_ENERGY][0] = 0.05 * RICH.ledger.hand_reserve[0] + 3e-4
+    assert hand.step([0.0, 0.0, 5e-5, 0.0, 0.0, 0.0])[2] < 0.1 * full
 
 
 def test_wrench_cross_fades_after_missing_packets():
