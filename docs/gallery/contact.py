@@ -2,7 +2,7 @@
 Contact: no threshold on the measured force finds it
 ====================================================
 
-The paper's Fig. 8. The tool touches a leaf spring in the middle of a fast swing (shaded: the truth
+The paper's Fig. 8. The tool touches a sheet spring in the middle of a fast swing (shaded: the truth
 of the simulation). In the measured force the touch is smaller than the swing around it.
 """
 

@@ -597,7 +597,7 @@ def compare_passivity(
 ) -> None:
     """Compare passivity methods over networks with delay.
 
-    The station moves freely and presses on a soft and a stiff leaf spring. In a model with one
+    The station moves freely and presses on a soft and a stiff sheet spring. In a model with one
     degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
     pictures and report.html.
     """

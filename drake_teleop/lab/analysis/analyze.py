@@ -179,9 +179,9 @@ def displacement_into_leaf(scenario: Scenario) -> list[float]:
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
         raise DrakeTeleopError(
-            "is 0, so that the slave cannot press on the leaf spring",
+            "is 0, so that the slave cannot press on the sheet spring",
             where="kinematic_scaling.translation_scale",
-            remedy="choose a scale above 0, or leave the leaf spring (sheet_spring) out",
+            remedy="choose a scale above 0, or leave the sheet spring (sheet_spring) out",
         )
     tip = NominalSlave(scenario.slave).start_tip
     displacement = (

@@ -1,6 +1,6 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies: the whole station presses on leaf springs (`delayed_contact`), a hand lets go and
+Three studies: the whole station presses on sheet springs (`delayed_contact`), a hand lets go and
 taps (`release_and_taps`), and the longest stable round trip (`one_dof`).
 """
 
@@ -161,7 +161,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
 def simulate_press(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Simulate a press on a leaf spring; return its table row and time series."""
+    """Simulate a press on a sheet spring; return its table row and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]

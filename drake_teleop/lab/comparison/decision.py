@@ -37,7 +37,7 @@ class MethodResult:
 
     @property
     def displayed_share(self) -> str:
-        """Least displayed over scaled contact force of all leaf springs [%]; "" if unstable."""
+        """Least displayed over scaled contact force of all sheet springs [%]; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 

@@ -1,4 +1,4 @@
-"""Task of the whole station: swing, press on a leaf spring, rest."""
+"""Task of the whole station: swing, press on a sheet spring, rest."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def delayed_contact(
 
 
 def leaf_thickness(stiffness: float) -> float:
-    """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
+    """Return the thickness [m] of a sheet spring with this stiffness [N/m]."""
     unit = SheetSpring(length=_LEAF_SPRING_LENGTH_M, width=_LEAF_WIDTH_M, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 

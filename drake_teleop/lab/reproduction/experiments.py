@@ -63,7 +63,7 @@ class IdealMotion:
 
 @dataclass(frozen=True, eq=False)
 class ContactMotion:
-    """Recorded contact transition, and the same movement without the leaf spring.
+    """Recorded contact transition, and the same movement without the sheet spring.
 
     Attributes:
         measured_wrench: (N, 6) measured wrench without offsets, F - F_o.
@@ -93,7 +93,7 @@ def simulate_free_motion(
 
 
 def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
-    """Simulate the contact transition with and without the leaf spring."""
+    """Simulate the contact transition with and without the sheet spring."""
     touched = _run_station(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
     free = _run_station(without_leaf_spring(scenario), estimate, free_stage)
@@ -232,7 +232,7 @@ def identification_values(load: LoadIdentification, scenario: Scenario) -> Named
 
 
 def without_leaf_spring(scenario: Scenario) -> Scenario:
-    """Return the scenario without the leaf spring, with the next seed."""
+    """Return the scenario without the sheet spring, with the next seed."""
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
 
