@@ -94,7 +94,7 @@ _WITHHELD_WRENCH_RECOVERY_S = 0.1
 _MAX_HAND_ACCELERATION = 5.0  # m/s^2
 _FULL_DRAG_HAND_SPEED = 0.02  # m/s
 _FADE_TIME_AT_HAND_REST_S = 0.1
-_LOST_HAND_MOTION_ENCODER_STEPS = 1.1  # of the encoders
+_LOST_HAND_MOTION_ENCODER_STEPS = 1.1
 _DRAG_ON_LEVEL, _DRAG_OFF_LEVEL = 1.0 - RESERVE_SHARE_AT_MASTER, 1.0 - 1e-9  # of a reserve
 _HAND_BRAKE_FORCE_N, _FULL_BRAKE_HAND_SPEED, _NO_BRAKE_HAND_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
@@ -152,7 +152,7 @@ class LedgerConfig:
         "m, rad",
         0.0,
         0.1,
-        "step of the hand's measured pose; null: that of the station's device, 0 without one",
+        "position and rotation step of the device's encoders; null: as in the device's data sheet",
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
@@ -233,6 +233,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _remove_encoder_flicker(dx, p, memory):
+    """Write the hand's displacement beyond the lost motion into memory (docs/theory.md, M2)."""
     lost, steady = memory[_LOST_HAND_MOTION], memory[_HAND_STEP_WITHOUT_FLICKER]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
