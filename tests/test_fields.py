@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import drake_teleop
-from drake_teleop.common.config import FieldInfo, fields_of
+from drake_teleop.common.config import FieldInfo, check_ranges, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.station.operator.operator import OperatorConfig
@@ -62,6 +62,23 @@ def test_lists_blocks_and_optional_fields() -> None:
     vectors = named(Factor, "vectors")
     assert (vectors.kind, vectors.list_depth, vectors.length) == ("number", 2, None)
     assert named(ForceScalingConfig, "eta").optional
+
+
+VECTORS = {
+    f"{block.__name__}.{entry.name}": (block, entry)
+    for block, entry in everything(Scenario)
+    if entry.unit and entry.list_depth == 1
+}
+
+
+@pytest.mark.parametrize("place", sorted(VECTORS))
+@pytest.mark.parametrize("surplus", [-1, 1])
+def test_vector_of_another_length_raises(place: str, surplus: int) -> None:
+    block, entry = VECTORS[place]
+    assert entry.length is not None
+    value = [max(entry.low, 0.0)] * (entry.length + surplus)
+    with pytest.raises(DrakeTeleopError, match=rf"{entry.name}: .*{len(value)} number"):
+        check_ranges(block(**{entry.name: value}), "scenario")
 
 
 def test_instance_gives_its_own_defaults() -> None:

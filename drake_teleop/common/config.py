@@ -24,12 +24,15 @@ TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", s
 _assignment_checks_enabled = ContextVar("checks_assignments", default=True)
 
 
-def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
+def quantity(
+    default: Any, unit: str, low: float, high: float, doc: str, *, length: int | None = None
+) -> Any:
     """Return a dataclass field for a number or, with a list as default, a vector.
 
     `unit` is an SI unit, "1" if dimensionless; `low` and `high` limit the plausible range.
+    `length` is that of a vector whose default is None.
     """
-    metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
+    metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
     if isinstance(default, list):
         metadata["length"] = len(default)
         return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)

@@ -153,6 +153,7 @@ class LedgerConfig:
         0.0,
         0.1,
         "position and rotation step of the device's encoders; null: as in the device's data sheet",
+        length=2,
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:

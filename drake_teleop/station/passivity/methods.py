@@ -199,6 +199,7 @@ class _CommonMethodConfig:
         1e6,
         "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
         " mass and servo of the station's arm at the start",
+        length=2,
     )
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
 

@@ -76,7 +76,12 @@ class ForceScalingConfig:
         None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
     )
     gripper_phi: list[float] | None = quantity(
-        None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"
+        None,
+        "kg, kg m, kg m^2",
+        -1e3,
+        1e3,
+        "phi of the gripper alone; null: all is gripper",
+        length=10,
     )
     force_scale: float = quantity(
         1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
