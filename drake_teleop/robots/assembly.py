@@ -151,11 +151,13 @@ _MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
 class PartStreams:
-    """Source of wrenches and motions, from one or two sources of parts."""
+    """Source of wrenches and motions, from one or two sources of parts; `where` names them."""
 
     live = True
 
-    def __init__(self, wrench: PartSource, motion: PartSource | None = None) -> None:
+    def __init__(
+        self, wrench: PartSource, motion: PartSource | None = None, *, where: str = "the source"
+    ) -> None:
         self._wrench, self._motion = wrench, motion
         self.dt, self.two_clocks = wrench.dt, motion is not None
         streams = (wrench if motion is None else motion).streams
@@ -163,8 +165,9 @@ class PartStreams:
         if not self.motion_stream:
             raise DrakeTeleopError(
                 "delivers no motion",
-                where="the source",
-                remedy="give --motion, such as rtde://HOST",
+                where=where,
+                remedy="give --motion, such as rtde://HOST, or for ROS 2 pose=, tf= or imu= in the"
+                " address",
             )
 
     def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:

@@ -156,7 +156,7 @@ def _open_parts(
     try:
         other = None if motion is None else _open_part_source(motion, 1.0 / wrench.dt, names)
         if arm is None:
-            return PartStreams(wrench, other)
+            return PartStreams(wrench, other, where=motion or address)
         motion_source = wrench if other is None else other
         if JOINTS not in motion_source.streams:
             raise DrakeTeleopError(
