@@ -308,6 +308,16 @@ def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:
     assert (wrench["force"]["unit"], wrench["torque"]["unit"]) == ("FILL IN", "N m")
 
 
+@pytest.mark.slow
+def test_a_wrong_clock_and_the_sign_are_named_together(tmp_path: Path) -> None:
+    columns = good()
+    planted.sign(columns)
+    planted.wrench_clock(columns)
+    found = planted.findings(tmp_path, columns, imu=False)
+    assert set(found) == {"sign", "clock"}
+    assert "wrench.time.offset: -0.5" in found["clock"]
+
+
 def drafted(names: str) -> dict[str, Any]:
     columns = dict.fromkeys(names.split(", "), np.arange(60.0) * 0.01)
     return draft_description(Table(Path("x.csv"), columns), Path()).streams

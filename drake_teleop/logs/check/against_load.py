@@ -172,10 +172,12 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
     delay = None if log.static else estimate_delay(data.read_whole_log(edited), 30.0)
-    if finding is None:  # The edit shifted the clock of the wrench to the nearest 20 ms.
-        assert description.wrench is not None and edited.wrench is not None
-        shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
-        return lag_finding(description, shift), shift
+    if description.wrench is not None and edited.wrench is not None:
+        shift = edited.wrench.time.offset - description.wrench.time.offset
+        if shift:  # of the clock of the wrench, to the nearest 20 ms
+            delay = shift + (delay or 0.0)
+    if finding is None:
+        return lag_finding(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
     first = Finding(finding.name, message, finding.fields)
@@ -200,6 +202,8 @@ def _edits_with_far_better_fit(
             fit is not None and finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN
         ):
             negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
+        elif fit is not None and finding is None:  # a clock and the sign
+            negative.append((fit, *next(wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = (
         VALID_UNEXPLAINED + given.noise_share,
