@@ -115,7 +115,6 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass_inertias: names of undetermined inertias, replaced by those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -133,7 +132,6 @@ class EliminatedLog:
 
     log: Log
     phi: Array
-    point_mass_inertias: tuple[str, ...]
     offsets: Array
     tare_fraction: float
     delay_s: float
@@ -313,8 +311,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     checks = check_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
-    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
-        return checks
+    except DrakeTeleopError as error:
+        findings = checks.findings or (Finding("payload", str(error)),)
+        return replace(checks, findings=findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
@@ -463,7 +462,7 @@ def _read_and_eliminate_log(
             where="causal_tare_s",
             remedy="give causal as well, or remove it",
         )
-    phi, point_mass = usable_phi(identification)
+    phi, _ = usable_phi(identification)
     phi_object = phi - phi_gripper
     aligned = read_aligned_log(
         path,
@@ -535,12 +534,12 @@ def _read_and_eliminate_log(
         )
     contact = low_pass_wrench(contact)
     findings = _find_suspected_errors(Path(path), log.wrench - offsets, contact, identification)
-    if not findings:  # a wrong description would explain the clock, too
-        log = replace(log, notes=(*log.notes, *aligned.clock_notes))
+    notes = (*log.notes, *notes_on_undetermined_load(identification))
+    # A wrong description would explain the clock, too.
+    log = replace(log, notes=notes if findings else (*notes, *aligned.clock_notes))
     return EliminatedLog(
         log=log.select_rows(known),
         phi=phi,
-        point_mass_inertias=point_mass,
         offsets=offsets,
         tare_fraction=fraction,
         delay_s=delay_s,
@@ -589,6 +588,20 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETER_NAMES[10 + i] for i in replaced)
+
+
+def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
+    """Return a note on the mass and its moments, and one on inertias, if they are not identified."""
+    named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
+    moments = [name for name, verdict in named if verdict == "not"]
+    return tuple(
+        f"{', '.join(names)} of the load are not identified: {effect}"
+        for names, effect in (
+            (moments, "their errors are in the contact wrench; identify the load again"),
+            (usable_phi(load)[1], "those of a point mass are used"),
+        )
+        if names
+    )
 
 
 def _find_suspected_errors(

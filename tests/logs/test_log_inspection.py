@@ -318,6 +318,16 @@ def test_a_wrong_clock_and_the_sign_are_named_together(tmp_path: Path) -> None:
     assert "wrench.time.offset: -0.5" in found["clock"]
 
 
+def test_a_record_at_rest_is_a_finding(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    columns = {name: np.repeat(x[:1], len(x), axis=0) for name, x in good().items()}
+    columns["t"] = good()["t"]
+    for name, noise in (("force", 0.05), ("torque", 0.003)):
+        columns[name] = columns[name] + rng.normal(size=(2000, 3)) * noise
+    found = planted.findings(tmp_path, columns, imu=False)
+    assert set(found) == {"payload"} and "depends on its mass; record slow" in found["payload"]
+
+
 def drafted(names: str) -> dict[str, Any]:
     columns = dict.fromkeys(names.split(", "), np.arange(60.0) * 0.01)
     return draft_description(Table(Path("x.csv"), columns), Path()).streams
