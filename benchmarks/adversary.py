@@ -127,12 +127,16 @@ def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
         return found
     over = round(let_go_at(case) / PERIOD)
     if case["end"] == "lets go":
-        free = run.master[over - 1 : over + 2000]
+        free = run.master_position[over - 1 : over + 2000]
         found.speed = float(np.nanmax(np.abs(np.diff(free)), initial=0.0)) / PERIOD
         found.travel = float(np.nanmax(np.abs(free - free[0]), initial=0.0))
     begin = round((case["until"] + 0.8) / PERIOD)
     still = slice(begin, None if case["end"] == "holds on" else over, 10)
-    found.cycle = max(_cycling(x[still].tolist()) for x in (run.master, run.slave)) * 10 * PERIOD
+    found.cycle = (
+        max(_cycling(x[still].tolist()) for x in (run.master_position, run.slave_position))
+        * 10
+        * PERIOD
+    )
     return found
 
 
@@ -278,7 +282,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     for name in names:
         one = PassivityConfig(method=name)
         let_go = run_one_dof(REFERENCE, one, steady, intent=push, grip=hand)
-        free = let_go.master[8999:11000]
+        free = let_go.master_position[8999:11000]
         rows = {
             "taps": [least(one, REFERENCE, steady, intent=tap)],
             "taps, bursts": [least(one, medium, bursts, seed=n, intent=tap) for n in range(10)],
@@ -286,7 +290,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
                 least(one, medium, steady, delays=outages(n), timeout=0.1) for n in range(20)
             ],
             "let go": [
-                abs(float(let_go.felt[8999])),
+                abs(float(let_go.hand_force[8999])),
                 float(np.abs(np.diff(free)).max()) / PERIOD,
                 float(np.abs(free - free[0]).max()),
             ],

@@ -64,13 +64,13 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     good = found.stable and quiet and abs(found.force_error) < EXACT
     share = found.felt_force / undelayed
     holds = (run.t >= task.press_end + 2 * round_trip + SOON) & (run.t < task.release_start)
-    at_last = np.mean(run.felt[holds & (run.t >= task.release_start - task.rest_window)])
+    at_last = np.mean(run.hand_force[holds & (run.t >= task.release_start - task.rest_window)])
     return {
         "stable": found.stable,
         "good": good,
         "strong": good and share > STRONG,
         "felt": share,
-        "prompt": bool(np.all(np.abs(run.felt[holds] / at_last - 1.0) < NEAR)),
+        "prompt": bool(np.all(np.abs(run.hand_force[holds] / at_last - 1.0) < NEAR)),
     }
 
 

@@ -129,7 +129,7 @@ def architectures() -> dict[str, Any]:
         )
         of = figures_of_run(run, model, task)
         swing = (run.t > task.swing_start) & (run.t < task.swing_end)
-        apart = np.sqrt(np.mean((run.master - run.slave)[swing] ** 2))
+        apart = np.sqrt(np.mean((run.master_position - run.slave_position)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf
         cells[method, trip, loss] = 1e3 * float(apart), float(error)
     rows = [

@@ -209,7 +209,7 @@ def one(case: Case, motion: str, seed: int, chain: str) -> dict[str, Any]:
     start = time.process_time()
     if chain == "new":
         found = estimate_from_poses(
-            t, wrench, poses, GRAVITY_W, p_SoPo_S=case.shift, gain=case.gain
+            t, wrench, poses, GRAVITY_W, p_SoPo_S=case.shift, gain_std=case.gain
         )
         theta, deviations = found.theta, np.sqrt(np.diag(found.covariance))
         turn = Rotation.from_matrix(found.frame.R_SP).as_rotvec(degrees=True)

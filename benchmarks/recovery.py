@@ -62,10 +62,10 @@ class Row:
 
     def add(self, run: OneDofRun) -> None:
         """Counts one run."""
-        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.felt)
-        beside = float(np.abs(run.slave - run.master)[end].max())
+        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.hand_force)
+        beside = float(np.abs(run.slave_position - run.master_position)[end].max())
         at_rest = float(felt[end].max())
-        still = np.ptp(run.master[end]) < 0.5e-3
+        still = np.ptp(run.master_position[end]) < 0.5e-3
         self.runs += 1
         self.recovered += bool(beside < 2e-3 and at_rest < 0.1 and still)  # never if not finite
         silent = run.time_without_packets[:, 0] > TIMEOUT

@@ -90,6 +90,30 @@ def vague_constants() -> list[str]:
     return found
 
 
+def names_in(node: ast.ClassDef) -> set[str]:
+    names = {each.attr for each in ast.walk(node) if isinstance(each, ast.Attribute)}
+    names |= {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+    return names | {each.name for each in ast.walk(node) if isinstance(each, ast.FunctionDef)}
+
+
+def absent_attributes() -> list[str]:
+    """Return attributes that a class lists in its docstring but does not have."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            text = (ast.get_docstring(node) or "") if isinstance(node, ast.ClassDef) else ""
+            section = text.partition("Attributes:\n")[2].partition("\n\n")[0]
+            for line in re.findall(r"^    (\w[\w, ]*):", section, flags=re.M):
+                found += [
+                    f"{node.name}.{name}" for name in set(line.split(", ")) - names_in(node)
+                ]  # fmt: skip
+    return found
+
+
+def test_documented_attributes_exist() -> None:
+    assert absent_attributes() == []
+
+
 def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
     assert first_words() == []
 

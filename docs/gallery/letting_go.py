@@ -22,7 +22,9 @@ figure, axes = plt.subplots(figsize=(7, 3.5))
 for method in ("none", "tdpa", "charged_tdpa", "ledger"):
     passivity = PassivityConfig(method=method)
     run = run_one_dof(model, passivity, PRESETS["internet"], intent=intent, grip=grip)
-    axes.plot(run.t - run.t[gone], 1e3 * (run.master - run.master[gone]), label=method)
+    axes.plot(
+        run.t - run.t[gone], 1e3 * (run.master_position - run.master_position[gone]), label=method
+    )
 axes.set(xlabel="t after letting go [s]", ylabel="way of the device [mm]")
 axes.set(xlim=(-0.2, 0.8), ylim=(-120, 20))
 axes.legend()

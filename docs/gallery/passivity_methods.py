@@ -19,8 +19,8 @@ figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=Tr
 for axes, method in zip(panels.flat, METHODS, strict=True):
     run = run_one_dof(REFERENCE, PassivityConfig(method=method), PRESETS["internet"])
     found = figures_of_run(run, REFERENCE)
-    axes.plot(run.t, REFERENCE.force_scale * run.wall, color=GREY, linewidth=0.8)
-    axes.plot(run.t, run.felt, color=BLUE, linewidth=0.8)
+    axes.plot(run.t, REFERENCE.force_scale * run.wall_force, color=GREY, linewidth=0.8)
+    axes.plot(run.t, run.hand_force, color=BLUE, linewidth=0.8)
     axes.set_title(f"{method}: {'stable' if found.stable else 'unstable'}")
     axes.set_ylim(-6, 3)
 figure.supxlabel("t [s]", fontsize="medium")

@@ -62,7 +62,7 @@ def test_step_response_equals_closed_form_after_dead_time(arm):
     states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)
     response = (states[:, 0] - HOME[0]) / 0.02
     assert np.abs(response[: round(UR.dead_time / PERIOD)]).max() < 1e-9
-    w = np.sqrt(UR.gain)
+    w = np.sqrt(UR.acceleration_per_error)
     damping = 0.5 * w * UR.lookahead
     turning = w * np.sqrt(1 - damping**2)
     t = (np.arange(800) + 1) * PERIOD - UR.dead_time

@@ -49,7 +49,10 @@ class CutLoop:
     def from_multipliers(
         cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
     ) -> CutLoop:
-        """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
+        """Return the loop with multipliers (..., n) of the open and the closed loop.
+
+        `period` is that of the hand [s]. The crossings are those of |L| = `level`.
+        """
         shape, n = opened.shape[:-1], opened.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _write_gain_crossings(

@@ -1,4 +1,7 @@
-"""Corrections of a log description with which a load explains the wrench, Eqs. (1)-(2), (5)."""
+"""Corrections of a log description that let a rigid load explain the wrench, Eqs. (1)-(2), (5).
+
+Corrected are signs, axes, units and clocks of the recorded signals.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ class LoadFit:
     Attributes:
         unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
         mass: fitted mass [kg].
-        independent: number of independent samples.
+        independent_samples: number of samples with independent noise.
     """
 
     unexplained: float
