@@ -1,8 +1,8 @@
-"""What the notebooks promise: run behind each of them when the site is built, and not shown."""
+"""Hidden checks of the notebooks, executed after each of them when the site is built."""
 
 from __future__ import annotations
 
-#: What must hold once a notebook has run, in its own variables.
+#: Assertions by notebook, about its variables.
 CHECKS = {
     "01_quickstart": """
 assert abs(load.mass - 3.13) < 0.01

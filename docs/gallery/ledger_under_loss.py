@@ -2,9 +2,9 @@
 The ledger while packets are lost
 =================================
 
-A third of all packets is lost, in bursts of 50 ms, on a round trip of 100 ms. The books of the
-ledger hold nevertheless, for its counters are cumulative: the next packet has all that the lost
-ones had.
+A third of all packets is lost, in bursts of 50 ms, over a round trip of 100 ms. The energy balance
+of `ledger` remains correct, because its counters are cumulative: the next packet includes the
+energy of all lost ones.
 """
 
 import matplotlib.pyplot as plt

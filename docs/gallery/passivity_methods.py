@@ -2,9 +2,9 @@
 Every passivity method over one network
 =======================================
 
-In one degree of freedom: the hand swings freely, presses a wall of 5.1 kN/m, holds and goes back,
-over a round trip of 100 ms with jitter and loss. Blue is the displayed force, grey what the wall
-gives.
+In one degree of freedom, the hand swings freely, presses on a wall of 5.1 kN/m, holds and retracts,
+over a round trip of 100 ms with jitter and loss. Blue: displayed force; grey: contact force times
+the force scale.
 """
 
 import matplotlib.pyplot as plt
