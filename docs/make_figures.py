@@ -159,7 +159,7 @@ def _arrow(
     colour: str,
     side: int = 1,
 ) -> None:
-    """Draw an arrow between two blocks' edges, with its label above it or at its right (side = 1)."""
+    """Draw an arrow between two blocks' edges, with its label above or right (side = 1)."""
     (x0, y0), (x1, y1) = start, stop
     if y0 == y1:
         shift = (WIDTH / 2) * (1 if x1 > x0 else -1)
