@@ -2,8 +2,7 @@
 A gripper grasps an object
 ==========================
 
-At 5 s the moving tool grasps 0.8 kg. The estimator distinguishes the object from contact, and
-identifies it.
+At 5 s the moving tool grasps 0.8 kg. The estimator distinguishes it from contact and identifies it.
 """
 
 import matplotlib.pyplot as plt
