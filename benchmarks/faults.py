@@ -381,7 +381,7 @@ def faults_of(name: str, each: int) -> list[Fault]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--each", type=int, default=56, help="faults for each station")
     parser.add_argument("--station", choices=STATIONS, action="append", help="all by default")
     arguments = parser.parse_args()

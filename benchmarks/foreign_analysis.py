@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
     )
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     rows = {}
     for arm in arguments.arms.split(","):

@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="targets, with commas between them")
     parser.add_argument("--cases", type=int, help="of each target, in place of --seconds")
     parser.add_argument("--folder", type=Path, help="of findings; default: out/fuzz")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="TARGET-anything.suffix")
     arguments = parser.parse_args()
     if arguments.replay:

@@ -63,7 +63,7 @@ def smallest(t: Array, v: Array, a: Array, weight: float, inertia: float) -> flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--swings", type=int, default=40)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     asked = parser.parse_args()
     t = np.arange(round(_END * 500)) / 500
     swings = [swing(np.random.default_rng([k, 31]), t) for k in range(asked.swings)]

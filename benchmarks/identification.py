@@ -371,7 +371,7 @@ def consistent_load() -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--samples", type=int, default=1_000_000, help="of the batch")
     arguments = parser.parse_args()
     figures: dict[str, float] = {"cores": float(os.cpu_count() or 0)}

@@ -158,7 +158,7 @@ def false_verdicts(name: str, seeds: int) -> dict[str, int]:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the study and prints it; returns 0 if every share is within 90-98 %, 1 otherwise."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--seeds", type=int, default=500, help="records for each colour")
     options = parser.parse_args(arguments)
     shares = {colour: coverage(colour, options.seeds) for colour in COLOURS}

@@ -172,7 +172,7 @@ def prepared(folder: Path, rows: Array) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--readings", type=int, default=1_000_000)
     options = parser.parse_args()
     rows = readings(options.readings)

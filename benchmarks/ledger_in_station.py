@@ -182,7 +182,7 @@ def print_cell(one: Cell) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the cells and prints them; returns 0 if every one keeps every promise."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS))
     parser.add_argument(
         "--leaf", nargs="+", choices=list(LEAF_THICKNESSES_M), default=list(LEAF_THICKNESSES_M)

@@ -192,7 +192,7 @@ PUBLICATIONS: dict[str, Callable[[], dict[str, Any]]] = {
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=PUBLICATIONS, default=list(PUBLICATIONS))
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     found = {}
     for name in options.only:

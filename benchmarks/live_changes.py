@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(choice_names()["method"]))
     parser.add_argument("--networks", default=",".join(networks))
     parser.add_argument("--depth", type=float, default=95.0, help="of the hand's target [mm]")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     scenario = live_scenario(LoadScenario("touch"))

@@ -226,7 +226,7 @@ def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     arm = AddSlavePlant(DiagramBuilder(), Slave(), None).arm
     sources = by_source(Record(arm, motion(arm, 2.63, AMPLITUDE)))

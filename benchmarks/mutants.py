@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="run what survived once more")
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[1])
     parser.add_argument("--folder", type=Path, help="of copies and records; default: temporary")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     root = arguments.root.resolve()
     folder = arguments.folder or Path(tempfile.gettempdir()) / f"{PACKAGE}_mutants"

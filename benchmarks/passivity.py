@@ -341,7 +341,7 @@ def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str,
 def main(arguments: list[str] | None = None) -> int:
     """Runs the study and prints it; returns 0 if the bounds hold and the baselines break them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
     parser.add_argument("--seconds", type=float, default=10.0, help="simulated time of each [s]")
     options = parser.parse_args(arguments)

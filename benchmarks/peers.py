@@ -403,7 +403,7 @@ def described(records: Path, record: str, folder: Path) -> Path:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--loads", type=int, default=30)
     parser.add_argument("--rls", type=int, default=0, help="loads for recursive least squares")
     parser.add_argument("--ntnu", type=Path, help="folder of the records of NTNU")

@@ -409,7 +409,7 @@ def main() -> None:
     parser.add_argument("--no-good", action="store_true")
     parser.add_argument("--no-bad", action="store_true")
     parser.add_argument("--data", type=Path, help="folder of real records")
-    parser.add_argument("--json", type=Path, help="write the figures and messages here")
+    parser.add_argument("--json", type=Path, help="file for the figures and messages")
     arguments = parser.parse_args()
     cases = [] if arguments.no_bad else [(k, of_kind, KINDS[k].streams) for k in KINDS]
     cases += [] if arguments.no_good else [(k, alarms, ALL) for k in GOOD]

@@ -277,7 +277,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="cases whose name has one of these")
     parser.add_argument("--motions", default="FP")
     parser.add_argument("--no-present", action="store_true", help="the new estimate alone")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     report: dict[str, Any] = {"runs": arguments.runs, "seed": arguments.seed}
     seeds = range(arguments.seed, arguments.seed + arguments.runs)

@@ -326,7 +326,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--whole", type=int, default=3, help="seeds that are simulated as a whole")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     motion, swing, trajectory = true_motions()
     peak = float(np.linalg.norm(swing[:, :3], axis=1).max())

@@ -160,7 +160,7 @@ def holds(rows: list[Row]) -> bool:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the study and prints it; returns 0 if `holds`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
     options = parser.parse_args(arguments)
     began = time.monotonic()

@@ -167,7 +167,7 @@ def load_of(path: Path) -> Identification:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real records")
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="more logs")
     options = parser.parse_args()

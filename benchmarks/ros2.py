@@ -248,7 +248,7 @@ def main() -> None:
     parser.add_argument("--loads", type=int, default=50, help="calibrations from topics")
     parser.add_argument("--services", type=int, default=2, help="calibrations by the service")
     parser.add_argument("--seconds", type=float, default=20.0, help="of the measured loop")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         figures = processing(Path(folder), options.seconds) if options.seconds else {}

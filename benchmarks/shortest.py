@@ -95,7 +95,7 @@ def reached(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--restarts", type=int, default=20)
     parser.add_argument("--records", type=int, default=50)
     options = parser.parse_args()

@@ -44,7 +44,7 @@ _TOGETHER = 12.0  # simulated seconds, long enough for two processes to start at
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--ledger", action="store_true", help="only what ledger costs")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     free, contact = LoadScenario("free_motion_force"), LoadScenario("contact_transition")
     if arguments.ledger:

@@ -86,7 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(ARMS))
     parser.add_argument("--devices", default=",".join((PHANTOM_NAME, *FIGURES, LEADER_NAME)))
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
     )

@@ -51,7 +51,7 @@ def main() -> None:
     )
     parser.add_argument("--shards-in", type=Path, help="of `--shards`: its folder")
     parser.add_argument("--no-cluster", action="store_true", help="without Dask")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         measure = sharded if arguments.shards else measured

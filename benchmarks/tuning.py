@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--draws", type=int, default=500, help="in one axis")
     parser.add_argument("--station-draws", type=int, default=10, help="in the whole station")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     asked = parser.parse_args(arguments)
     rows = []
     for seed in range(asked.stations):
