@@ -305,7 +305,7 @@ def followed(arm: ArmModel, follower: Any, motion: Array) -> dict[str, float]:
 
 
 def wavy(arm: ArmModel, samples: int) -> Array:
-    """Return a motion (samples, n) of all joints about a bent posture, at a third of their speed."""
+    """Return a motion (samples, n) of all joints about a bent posture, at a third of top speed."""
     lower, upper = limits(arm)
     t = PERIOD * np.arange(samples)[:, np.newaxis]
     n = arm.num_joints

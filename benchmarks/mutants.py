@@ -459,8 +459,8 @@ class _Watch:
         self._notes = json.loads(found.read_text()) if found.exists() else {"durations": {}}
 
     def pytest_sessionstart(self) -> None:
-        # Byte code is compared by whole seconds and length: a change and its reversal would use old
-        # code. tests/conftest.py enables writing.
+        # Byte code counts as current by whole seconds and length, so old code would be used after a
+        # change and its reversal. tests/conftest.py has enabled it.
         os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
