@@ -154,7 +154,7 @@ def plant_factor(d: Draft) -> None:
 
 
 def _a_time(d: Draft) -> float:
-    """Draw a time away from the ends, and 3 s from all other causes if there is room."""
+    """Draw a time away from the ends, and 3 s from all other causes if possible."""
     taken = [span for spans in d.truth.times.values() for span in spans]
 
     def room(time: float) -> float:

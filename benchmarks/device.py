@@ -6,10 +6,10 @@
 drive: time from taking a packet to sending the force, and the age of the force at the device.
 Python's garbage collection waits, as in the server. `silent_`: the force at the device 50 ms after
 the station falls silent. `leaf_` and `wall_`: the device's client with and without its passivity
-observer in simulated time, at the leaf (291 N/m at the hand) and a wall of 6 kN/m, with forces up
-to five samples late, and as late as just measured: least energy of the port [J], and the
-oscillation of the resting hand [m]. `station_wall_`: likewise with the whole station, in simulated
-time. `fuzz_`: random invalid messages. `--drive` adds the whole station in real time.
+observer in simulated time, at the leaf (291 N/m at the hand) and a wall of 6 kN/m. Forces are up to
+five samples late, and as late as just measured. Figures are the least energy of the port [J], and
+the oscillation of the resting hand [m]. `station_wall_`: likewise with the whole station, in
+simulated time. `fuzz_`: random invalid messages. `--drive` adds the whole station in real time.
 Baselines: the same without the observer; the share of time in which a process waited for a core.
 """
 

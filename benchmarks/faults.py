@@ -2,12 +2,10 @@
 
 `python benchmarks/faults.py [--json FILE] [--each N]`. The tool presses on a leaf; the displayed
 force is 1 to 1.5 N, and the hand moves by 4 mm. Ten stations have all methods, or no channel.
-Faults
-come at a random time, with random length (one sample to 0.35 s) and size, the same in every run:
-numbers that are not finite or far too large, samples that freeze or have a wrong time, a sensor
-that
-saturates, packets that are lost, late or out of order, a wrong load estimate, and changed scales.
-The force at the hand, at 2 kHz, must be
+Faults come at a random time, with random length (one sample to 0.35 s) and size, the same in every
+run. Numbers are not finite or far too large; samples freeze or have a wrong time; a sensor
+saturates; packets are lost, late or out of order; the load estimate is wrong; scales change. The
+force at the hand, at 2 kHz, must be
 
 - finite, and within the device's peak force (37.5 N);
 - without a step above 0.5 N from one sample to the next;

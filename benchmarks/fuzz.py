@@ -1,9 +1,12 @@
 """Does every damaged file or option end in a result or in one error line?
 
 The fuzzer damages good inputs by grammar and passes them to every reader (`fuzz_targets.py`,
-`fuzz_mutations.py`). A case is a finding if it raises anything but a DrakeTeleopError of one line
-of at most 1000 characters, if a warning or other text reaches stderr, if it takes more than 5 s
-of CPU (or a minute in all) or more than 4 GB, or if its process dies.
+`fuzz_mutations.py`). A case is a finding
+
+* if it raises anything but a DrakeTeleopError of one line of at most 1000 characters;
+* if a warning or other text reaches stderr;
+* if it takes more than 5 s of CPU (or a minute in all) or more than 4 GB;
+* if its process dies.
 
     python benchmarks/fuzz.py [--seconds 60] [--seed 0] [--only scenario,sdf] [--json FILE]
     python benchmarks/fuzz.py --replay FILE          # one case again, in this process
@@ -14,10 +17,10 @@ their number on the time.
 
 Coverage guides the choice of inputs: the lines of the package that every fourth case reaches are
 recorded, and a case that reaches a new line becomes an input for further cases. The fuzzer is not a
-published tool for these reasons (2026): Atheris does not continue after an abort or a hang, has no
-wheels for macOS and Python 3.10, and its changes of bytes do not pass a parser, so that
-grammars would be necessary all the same; hypothesis needs a test that names the numbers to
-maximise, and its cases change from version to version.
+published tool for these reasons (2026): Atheris does not continue after an abort or a hang, and has
+no wheels for macOS and Python 3.10. Its changes of bytes do not pass a parser, so that grammars
+would be necessary all the same. Hypothesis needs a test that names the numbers to maximise, and its
+cases change from version to version.
 """
 
 from __future__ import annotations

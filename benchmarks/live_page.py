@@ -3,14 +3,13 @@
     python benchmarks/live_page.py [--trials 20] [--seconds 60] [--json FILE]
 
 The page runs in headless Chromium without drawing (which takes longest without a graphics card).
-Latency is the time until the tool has moved by 0.2 mm in the page's scene, from the browser's time
-stamp of a pointer's move by 20 pixels, from that of a key, or from the push of a stick. Key and
-stick
-move the hand at 0.12 m/s. The baseline is the time that hand, device and arm take to move the tool
-that far, in simulated time (`way`). Vibration: time from the slice in which the contact force at
-the hand exceeds 0.5 N to `playEffect` of a simulated gamepad. Without a browser and in virtual
-time: share of frames of fast free vertical motion in which a gamepad would vibrate, by the contact
-force and by the measured one.
+Latency is the time until the tool has moved by 0.2 mm in the page's scene. It starts with the
+browser's time stamp of a pointer's move by 20 pixels or of a key, or with the push of a stick. Key
+and stick move the hand at 0.12 m/s. The baseline is the time that hand, device and arm take to move
+the tool that far, in simulated time (`way`). Vibration: time from the slice in which the contact
+force at the hand exceeds 0.5 N to `playEffect` of a simulated gamepad. Without a browser and in
+virtual time: share of frames of fast free vertical motion in which a gamepad would vibrate, by the
+contact force and by the measured one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Does the memory of a long simulation stay constant when its log is written to disk?
 
-The contact of Fig. 8 is repeated. Resident memory after the first minute and at the end, with the
-log written in parts, is compared with that of the same station with its log in memory, for at most
-two minutes. Each runs in a process of its own. It needs /proc, so Linux.
+The contact of Fig. 8 is repeated. The figures are the resident memory after the first minute and at
+the end, with the log written in parts. The baseline is the same station with its log in memory, for
+at most two minutes. Each runs in a process of its own. It needs /proc, so Linux.
 
     python benchmarks/memory.py [--seconds 600] [--json FILE]
 """

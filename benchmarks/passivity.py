@@ -2,14 +2,13 @@
 
 `python benchmarks/passivity.py [--json FILE] [--networks N] [--seconds S]` runs both ends of every
 method over N (10 000) random networks of 10 s at 500 Hz: delay up to 300 ms, jitter up to 100 %,
-loss up to 50 % or in bursts with up to 95 %, reordering, duplicates, and a device that saturates
-in half of them. The motion of both ends is random in six degrees of freedom with bounded
-acceleration. The wrenches are random and often push along the motion, so that they are active. It
-prints for each method the least energy of the channel at the pair f_k (x_k - x_(k-1)), which the
-methods can observe, and at the true port of a held wrench, f_(k-1) (x_k - x_(k-1)). Baselines in
-the
-same run: no method, wave variables that hold the last sample, and the two-layer tank without its
-margin. Methods without a bound, and `charged_tdpa`, run over every tenth network.
+loss up to 50 % or in bursts with up to 95 %, reordering, and duplicates. The device saturates in
+half of them. The motion of both ends is random in six degrees of freedom with bounded acceleration.
+The wrenches are random and often push along the motion, so that they are active. It prints for each
+method the least energy of the channel, for two pairs. The methods can observe f_k (x_k - x_(k-1));
+the true port of a held wrench is f_(k-1) (x_k - x_(k-1)). Baselines in the same run: no method,
+wave variables that hold the last sample, and the two-layer tank without its margin. Methods without
+a bound, and `charged_tdpa`, run over every tenth network.
 """
 
 from __future__ import annotations

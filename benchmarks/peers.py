@@ -14,11 +14,11 @@
   tare in free air: offsets are removed with an error of 0.2 N and 0.01 N m;
 * vendor: gravity alone, by the true mass and centre of mass as user input, and a tare at the start.
 
-With --rls, this number of loads is followed by recursive least squares of gravity, bias and
-mounting
-(a 3 x 4 matrix times [vertical, 1] for force and for torque, as arXiv 2604.23696 describes it; its
-forgetting factor is ours), in slow motion and in a hand's. Next to it: `identify` of one motion of
-`excite`, and a tare. Figures are the removed share of the wrench in the second half.
+With --rls, recursive least squares of gravity, bias and mounting is compared for this number of
+loads, in slow motion and in a hand's. Its model is a 3 x 4 matrix times [vertical, 1] for force and
+for torque, as arXiv 2604.23696 describes it; its forgetting factor is ours. Next to it: `identify`
+of one motion of `excite`, and a tare. Figures are the removed share of the wrench in the second
+half.
 
 The held-out record is another motion of the same load, with other offsets, a tare, and 30 Hz. With
 --bota, the Python of an environment that has bota-payload-utils and numpy, its estimator gets five

@@ -7,9 +7,9 @@ poses are 4 ms late. Cases have white or coloured (AR(1)) noise of the poses at 
 drifting offsets, or gain errors of the sensor. Baseline for the same record: the chain without
 splines (zero-phase low-pass, sliding polynomials).
 
-Columns: bias and root mean square of the mass's error [g], the bias over the stated deviation,
-that deviation [g], the error of the centre of mass [mm], and the share of the ten
-parameters within 1.96 stated deviations; with splines also the errors of the pose frame.
+Columns: bias and root mean square of the mass's error [g]; the bias over the stated deviation; that
+deviation [g]; the error of the centre of mass [mm]; the share of the ten parameters within 1.96
+stated deviations. With splines also the errors of the pose frame.
 
     python benchmarks/pose_noise.py [--runs 6] [--seed 0] [--only NAME ...] [--no-present]
         [--json FILE]

@@ -93,7 +93,7 @@ def _run(chain, chain_memory, estimator, estimator_memory, arm, noise, truth, sa
 
 
 def sampled(
-    sensor: WristSensorConfig, truth: Array, seed: int, believed: WristSensorConfig | None = None
+    sensor: WristSensorConfig, truth: Array, seed: int, assumed: WristSensorConfig | None = None
 ) -> tuple[Array, Array, Array, Array]:
     """Return wrench, s, omega, alpha at 8 kHz.
 
@@ -101,12 +101,12 @@ def sampled(
         sensor: the true sensor.
         truth: (N, 15 + n).
         seed: of the noise.
-        believed: sensor that the motion estimation assumes (default: the true one).
+        assumed: sensor that the motion estimation assumes (default: the true one).
     """
     n = truth.shape[1] - 15
     chain, memory = initialize_sensor_chain(sensor, n, 1 / RATE)
     motion = initialize_motion_estimator(
-        IDENTIFICATION.motion_estimation, believed or sensor, n, 1 / RATE
+        IDENTIFICATION.motion_estimation, assumed or sensor, n, 1 / RATE
     )
     blocks = len(truth) // SAMPLES_PER_NOISE_BLOCK + 1
     noise = np.random.default_rng(seed).standard_normal((blocks, NOISE_BLOCK_SIZE))
@@ -169,10 +169,10 @@ def residual(
     seed: int,
     offsets: Array,
     phi: Array = ARM.phi_load,
-    believed: WristSensorConfig | None = None,
+    assumed: WristSensorConfig | None = None,
 ) -> tuple[float, float, float]:
     """Return the residual: rms and peak of the force [N], rms of the torque [N m]."""
-    wrench, s, omega, alpha = sampled(sensor, swing, seed, believed)
+    wrench, s, omega, alpha = sampled(sensor, swing, seed, assumed)
     left = contact_wrench(wrench, offsets, s, omega, alpha, phi)
     force, torque = (np.linalg.norm(part, axis=1) for part in (left[:, :3], left[:, 3:]))
     return float(np.sqrt(np.mean(force**2))), float(force.max()), float(np.sqrt(np.mean(torque**2)))
@@ -279,7 +279,7 @@ def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, floa
     for name, late in ((f"accelerations {1e3 * LATE:g} ms late", LATE), ("6 ms late", 6e-3)):
         sensor = replace(nothing, acceleration_latency=late)
         rows[name] = over_seeds(
-            lambda seed, s=sensor: residual(s, swing, seed, np.zeros(6), believed=nothing), 1
+            lambda seed, s=sensor: residual(s, swing, seed, np.zeros(6), assumed=nothing), 1
         )
 
     def found(sensor: WristSensorConfig, seed: int) -> Identification:

@@ -1,13 +1,12 @@
 """Does every method recover from every random network within its force limit?
 
 `python benchmarks/recovery.py [--json FILE] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
-`lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter up to
-100 %, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's 0.1
-s.
-At 4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A method
-has recovered if at the end the slave is within 2 mm of the hand, the hand is at rest within 0.5 mm,
-and the displayed force is below 0.1 N. The force must never exceed 5 N, nor step up by more than
-0.5 N in the first 0.5 s after a silence.
+`lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter up to 100
+%, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's 0.1 s. At
+4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A method
+has recovered if at the end the slave is within 2 mm of the hand. The hand must be at rest within
+0.5 mm, and the displayed force below 0.1 N. The force must never exceed 5 N, nor step up by more
+than 0.5 N in the first 0.5 s after a silence.
 """
 
 from __future__ import annotations

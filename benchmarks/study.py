@@ -1,15 +1,13 @@
 """How well does a study use two cores, is it reproducible, and what does a kill cost?
 
 `python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
-(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by
-one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
-processes with SIGKILL at random times. Baseline of the efficiency is the one process, by the
+(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first). It
+uses one process, two processes, and a local Dask cluster, each with an empty folder, and once more
+two processes with SIGKILL at random times. Baseline of the efficiency is the one process, by the
 clock, so the machine must be idle. Parts are compared byte by byte. `--shards 8` runs only one
 process and, next to it, shards in random order: three are killed at random runs, submitted again
-and
-merged. The overhead is their CPU time beyond that of one process, with and without the repeated
-work
-of the kills: one more start each, and the CPU time since the last stored part.
+and merged. The overhead is their CPU time beyond that of one process, with and without the repeated
+work of the kills: one more start each, and the CPU time since the last stored part.
 """
 
 from __future__ import annotations

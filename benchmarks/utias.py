@@ -1,14 +1,12 @@
 """How accurate is each batch estimator for the UTIAS workshop tools?
 
 The protocol is that of Nadeau, Giamou, Kelly (ICRA 2023): ten tools, simulated stop-and-go motion
-of
-1000 samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and
-wrench,
-five seeds. There are no offsets, and all methods assume this. The table gives medians over tools
-and
-seeds of the error of mass [%], centre of mass [mm] and inertia about it [% of the norm], and the
-share of physically consistent results. Ordinary least squares on the same draws is the baseline.
-`consistent` without the motion's noise is the whitened semidefinite program of the literature.
+of 1000 samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and
+wrench, five seeds. There are no offsets, and all methods assume this. The table gives medians over
+tools and seeds. They are errors of mass [%], centre of mass [mm] and inertia about it [% of the
+norm], and the share of physically consistent results. Ordinary least squares on the same draws is
+the baseline. `consistent` without the motion's noise is the whitened semidefinite program of the
+literature.
 
 The recordings are not shipped; the folder contains one NPZ for each tool, with gravity upwards.
 

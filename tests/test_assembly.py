@@ -640,7 +640,7 @@ def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_n
 
 @pytest.mark.slow
 def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
-    """Without contact the first two are zero to rounding; for the motors this log is too slow."""
+    """The first two are zero to rounding without contact; for the motors this log is too slow."""
     recorded = assembled_over_a_network
     log = recorded.log
     accounts = station_accounts(log, recorded.scenario)
@@ -659,7 +659,7 @@ def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
 
 
 def test_the_motors_account_is_the_arms_speed(finely_logged, slave):
-    """Without friction, the motors' work beyond the weight is the arm's kinetic energy."""
+    """The motors' work beyond the weight is the arm's kinetic energy, as there is no friction."""
     log, scenario = finely_logged.log, finely_logged.scenario
     power = GAMMA * FORCE / np.array([TRANSLATION, ROTATION])
     given = -(station_accounts(log, scenario)[:, MOTOR] / power).sum(axis=1)

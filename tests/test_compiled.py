@@ -264,7 +264,7 @@ Path(f"{me} has ended").touch()
 @pytest.mark.long
 @pytest.mark.slow
 def test_two_parallel_first_runs_store_the_right_code(tmp_path):
-    """With numba's own cache, `double(1.5)` stays 2 after such runs."""
+    """The result of `double(1.5)` stays 2 after such runs with numba's own cache."""
     (tmp_path / "shared.py").write_text(
         HEAD + "\n@njit(cache=True)\ndef double(x):\n    return x + x\n"
     )

@@ -1,4 +1,4 @@
-"""Docstrings, comments and constants of the package are in plain language."""
+"""Docstrings of the project and constants of the package are in plain language."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ import pytest
 
 pytestmark = pytest.mark.checks
 
-PACKAGE = Path(__file__).parents[1] / "drake_teleop"
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "drake_teleop"
+FOLDERS = ("tests", "benchmarks", "docs", "docs/_ext", "docs/gallery")
+FILES = sorted(
+    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in (ROOT / each).glob("*.py"))]
+)
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
     *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But"),
 }
-"""A docstring begins with a verb or a noun phrase; properties may begin with "Whether"."""
+"""A docstring begins with a verb or a noun phrase; exceptions: "Whether" of
+properties, and questions of benchmarks."""
 GLOSSARY = re.compile(
     r"\b(house|rooms?|attic|felt|feels?|told|tells?|learnt|watched|knocks?|mend(s|ed)?|wanted"
     r"|to and fro|goes over|left behind|hunts|shaken|believe[ds]?|believable|nobody|somebody"
@@ -34,14 +40,15 @@ EXCEPTIONS = {
     "watched": "name of a module or of a state that users read",
     "room": "attribute of a posture: distance to the nearest limit",
     "tell": "in a table of summary names",
+    "knock": "case of a benchmark",
 }
 """Glossary words that may be in docstrings, in at most `MAX_EXCEPTIONS` places, and why."""
 MAX_EXCEPTIONS = 20
 
 
 def docstrings() -> Iterator[tuple[str, str]]:
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE).as_posix()
+    for path in FILES:
+        name = path.relative_to(ROOT).as_posix()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
             if documented and (text := ast.get_docstring(node)):
@@ -52,7 +59,7 @@ def first_words() -> list[str]:
     return [
         f"{where}: {text.splitlines()[0]}"
         for where, text in docstrings()
-        if text.split()[0].strip('`"(,.:') in NOT_FIRST
+        if text.split()[0].strip('`"(,.:') in NOT_FIRST and not text.splitlines()[0].endswith("?")
     ]
 
 
@@ -99,7 +106,7 @@ def names_in(node: ast.ClassDef) -> set[str]:
 def absent_attributes() -> list[str]:
     """Return attributes that a class lists in its docstring but does not have."""
     found = []
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in FILES:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             text = (ast.get_docstring(node) or "") if isinstance(node, ast.ClassDef) else ""
             section = text.partition("Attributes:\n")[2].partition("\n\n")[0]

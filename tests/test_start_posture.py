@@ -115,7 +115,7 @@ def slave_of(plan, path):
 
 
 def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
-    """In the middle of the ranges the shoulder leans forward and the forearm points back up."""
+    """The middle of the ranges has the shoulder forward and the forearm back up."""
     trap = {2: (-1.2, 2.8), 3: (-2.9, 2.6), 5: (-2.9, 2.9)}
     path = write_arm(tmp_path / "arm.urdf", ranges=trap)
     plan = plan_station(path, "ft")
@@ -328,7 +328,7 @@ def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
 
 @pytest.mark.parametrize("share", [0.5, 1.5])
 def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None:
-    """If no posture can be held, the error of the station names joint and torque."""
+    """The station's error names joint and torque if no posture can be held."""
     arm = NominalSlave(Slave()).arm
     q = np.random.default_rng(3).uniform(arm.lower, arm.upper, (40, arm.num_joints))
     torque = np.abs([holding_torque(arm, each) for each in q])

@@ -1,6 +1,6 @@
 """
-When was the robot touched?
-===========================
+Contacts in a robot's log
+=========================
 
 In a second record of the same gripper, a person pushes it three times. The load's wrench is
 eliminated; contact is detected where the remaining wrench exceeds the noise floor of free motion.
