@@ -77,7 +77,7 @@ GROUPS = {
     "inertia": slice(10, 16),
 }
 OUTCOMES = ("right", "part", "wrong", "silent", "error")
-_SMALLEST_MASS = 0.1  # mass whose natural scale is that of an empty sensor [kg]
+_SMALLEST_MASS = 0.1  # mass for the natural scales of an empty sensor [kg]
 _DEVIATIONS, _SHARE, _LATE_S, _FAINT = 4.0, 0.02, 0.1, 60.0
 
 

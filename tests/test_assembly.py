@@ -123,7 +123,7 @@ def delayed(method: str, **changes: object) -> Scenario:
         ),
         # A force is displayed at any speed of the hand.
         "passivity": PassivityConfig(method=method, retreat=[1e3, 1e3]),
-        # Ideal sensor, because the log has the last sample of each block, with other noise.
+        # Ideal sensor, because the log has other noise in the last sample of each noise block.
         "wrist_sensor__ideal": True,
     } | changes
     return turned(**changes)
@@ -439,7 +439,7 @@ def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_log
     sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
     motion = estimated_motion_std(scenario.motion_estimation, sensor, 6, period)
     estimator = RecursiveTotalLeastSquares(sensor.wrench_std(), motion, forgetting=0.98)
-    # The log has the last sample of each block, with other noise.
+    # The log has other noise in the last sample of each noise block.
     rows = instants(finely_logged, 500.0)
     rows = rows[log.t[rows] < 0.99 * SAMPLES_PER_NOISE_BLOCK * period]
     names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")

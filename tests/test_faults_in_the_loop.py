@@ -94,7 +94,7 @@ def test_one_sample_of_1e9_newtons_is_not_in_the_filters(direct):
         def change(x, time, size=size):
             sensor.offset[0] = offset[0] + (size if 0.62 <= time < 0.6205 else 0.0)
 
-        # This is the only fault; it has no kind.
+        # The fault has no kind: only `change` acts.
         tap.change = change
         result = direct.run(faults.Fault("", "", 0.62, ONE, 0, 0.0))
         tap.change = None
