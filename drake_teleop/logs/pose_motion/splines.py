@@ -31,7 +31,7 @@ _MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
 @dataclass(frozen=True, eq=False)
 class ImuSplineRows:
-    """IMU data at times t (K,) [s], with mean `rate` [Hz], in axes and clock of poses, without bias.
+    """IMU data at times t (K,) [s], with mean `rate` [Hz], in the poses' axes and clock, without bias.
 
     Attributes:
         acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
