@@ -1,7 +1,4 @@
-"""Corrections of a log description that let a rigid load explain the wrench, Eqs. (1)-(2), (5).
-
-Corrected are signs, axes, units and clocks of the recorded signals.
-"""
+"""Corrections of signs, axes, units and clocks of log descriptions that let a load fit, Eq. (5)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76).
-
-The signals are 1, the accelerations and products of velocities of the pose frame; their
-coefficients are free. The fit gives noise levels, delay, clock rate and knot spacing of the poses.
-"""
+"""Linear model of the wrench in 16 signals (1, a, -g, alpha, products of omega), (T73)-(T76)."""
 
 from __future__ import annotations
 
@@ -134,10 +130,7 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 
 def min_noise_power(Z: Array, band_sizes: Array) -> Array:
-    """Return the least noise power (6,) of the wrench channels: that of rounded numbers.
-
-    `Z` (bands, 38, 38) are `Spectra.second_moments`, `band_sizes` the frequencies in each band.
-    """
+    """Return the least noise power (6,) of the wrench, by rounding; Z: `Spectra.second_moments`."""
     return _min_noise_power_of_wrench(_moments_of_signals_and_wrench(Z)[2], band_sizes)
 
 
@@ -148,10 +141,7 @@ def _min_noise_power_of_wrench(ff: Array, band_sizes: Array) -> Array:
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels; each wrench channel has white noise or the best random walk, Eq. (T74).
-
-    `Z` (bands, 38, 38) are `Spectra.second_moments`. The walks differ in their corner frequency.
-    """
+    """Return noise levels, with the best of white noise and random walks (T74) in each channel."""
     levels = NoiseLevels.white_within_groups(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_COST_REDUCTION_BY_DRIFT
     shape = levels.relative_power.copy()
