@@ -591,7 +591,7 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
 
 
 def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
-    """Return a note on the mass and its moments, and one on inertias, if they are not identified."""
+    """Return notes on parameters of a load that are not identified: moments, and inertias."""
     named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
     moments = [name for name, verdict in named if verdict == "not"]
     return tuple(
