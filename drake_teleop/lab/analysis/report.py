@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import png_data_url, render_page
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import (
     BLACK,
     COLOURS,
@@ -51,7 +51,7 @@ class ReportCurves:
     """Data of the report's pictures that the summary does not contain."""
 
     axis: OneAxis
-    omega: NDArray[np.float64]  #: (n,) [rad/s]
+    omega: Array  #: (n,) [rad/s]
     H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
     closed_form: Complex  #: (n, 2, 2) two-port of the one-axis model
     wall: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
