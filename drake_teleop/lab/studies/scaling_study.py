@@ -25,7 +25,12 @@ from drake_teleop.common.files import (
 )
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import COLOURS, Picture, plot_style
-from drake_teleop.lab.studies.effects import estimate_means, measure_values
+from drake_teleop.lab.studies.effects import (
+    effect_half_widths_over_seeds,
+    means_and_half_widths_over_seeds,
+    measure_values,
+    values_by_seed,
+)
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 
@@ -212,15 +217,13 @@ def _merit_table(
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_FIELD].unique().to_list())
-    levels = np.array([etas.index(value) for value in rows[_ETA_FIELD]])
-    seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
-        for index, row in enumerate(table):
-            figures = (found.mean[index], found.half_width[index], found.effect_half_width[index])
-            names = (measure, f"{measure}_half", f"{measure}_effect_half")
-            row |= {n: v if np.isfinite(v) else None for n, v in zip(names, figures, strict=True)}
+        values = values_by_seed(rows, measure, by=_ETA_FIELD)
+        figures = *means_and_half_widths_over_seeds(values), effect_half_widths_over_seeds(values)
+        names = (measure, f"{measure}_half", f"{measure}_effect_half")
+        for row, at_eta in zip(table, np.column_stack(figures), strict=True):
+            row |= {n: v if np.isfinite(v) else None for n, v in zip(names, at_eta, strict=True)}
     return table
 
 
@@ -233,14 +236,10 @@ def draw_criteria(
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
-            levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
             for axes, measure in zip(line, CRITERIA.values(), strict=True):
-                found = estimate_means(
-                    measure_values(table, measure), levels, seeds, levels.max() + 1
-                )
-                means, bars = (
-                    a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half_width)
-                )
+                values = values_by_seed(table, measure)
+                means = means_and_half_widths_over_seeds(values)[0].reshape(-1, len(gammas))
+                bars = effect_half_widths_over_seeds(values).reshape(means.shape)
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
                         sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],
