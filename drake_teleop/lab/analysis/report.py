@@ -12,14 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from drake_teleop.common.files import write_picture, write_text
-from drake_teleop.common.html import png_data_url, render_page
+from drake_teleop.common.html import write_report_page
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import (
     BLACK,
     COLOURS,
     GREY,
-    PAGE_DPI,
     VERMILION,
     Picture,
     plot_style,
@@ -67,18 +65,15 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
         "widths": draw_z_widths(curves, summary["z_width"]),
         "maps": draw_stability_maps(curves, summary["grip"]),
     }
-    for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
-    page = render_page(
+    write_report_page(
+        out,
         "drake_teleop.lab.analysis",
-        "report.html.j2",
+        pictures,
         s=summary,
         wall=curves.wall[0],
-        pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )
-    write_text(out / "report.html", page)
 
 
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -10,10 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from drake_teleop.common.files import write_picture, write_text
-from drake_teleop.common.html import png_data_url, render_page
+from drake_teleop.common.html import write_report_page
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
+from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.comparison.decision import (
     VERDICT_CHATTERS,
     VERDICT_HOLDS,
@@ -61,18 +60,15 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "energy": draw_energy(summary, traces),
         "limits": draw_round_trip_limits(summary["one_dof"]),
     }
-    for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
-    page = render_page(
+    write_report_page(
+        out,
         "drake_teleop.lab.comparison",
-        "report.html.j2",
+        pictures,
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
         columns=[heading for _, heading, _, _ in RUN_COLUMNS],
         station=[(row, run_cells(row)) for row in summary["station"]],
         covering=summary["covering"],
-        pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
     )
-    write_text(out / "report.html", page)
 
 
 def run_cells(row: Mapping[str, Any]) -> list[str]:
