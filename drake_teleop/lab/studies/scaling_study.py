@@ -6,7 +6,6 @@ sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,23 +71,16 @@ class ScaleRating:
 
 
 def scaling_study_command(
-    out: Path,
-    *,
-    jobs: int = -1,
-    cluster: str | None = None,
-    repeats: int | None = None,
-    yes: bool | Callable[[str], bool] = False,
-    quiet: bool = False,
-    progress: bool = True,
+    out: Path, *, quiet: bool = False, progress: bool = True, **options: Any
 ) -> dict[str, Any]:
-    """Run the missing runs of the scaling studies; write results; return answer.json's content."""
+    """Run the missing runs of the scaling studies; write results; return answer.json's content.
+
+    The other options are those of `study_command`.
+    """
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
-        study_command(
-            name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
-            progress=progress, yes=yes,
-        )  # fmt: skip
+        study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     sigmas, gammas = _sigmas_and_gammas()
