@@ -133,7 +133,7 @@ class ExternalMaster(LeafSystem):
         now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
         if target is not None:
             turn = quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
-            held, motion = 1.0, [*(target[4:] - now[4:]), *quaternion_logarithm(turn)]
+            held, motion = 1.0, np.append(target[4:] - now[4:], quaternion_logarithm(turn))
         path = [held, context.get_time(), *now, *motion]
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 

@@ -96,7 +96,7 @@ def _force_norm(wrench):
 def finish_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
-    """Export the ports of a master side, with a block `CrossFade` if wanted, and build it."""
+    """Export the ports of a master side, with a block `CrossFade` on request, and build it."""
     wrench = master.GetInputPort("wrench_command")
     if cross_fade:
         block = builder.AddNamedSystem("cross_fade", CrossFade(period))

@@ -160,15 +160,15 @@ def _open_streams(
                     where=motion,
                     remedy="give a source such as rtde://HOST",
                 )
-        if arm is None:
-            return ReadingStreams(*opened)
-        if JOINTS not in opened[-1].streams:
-            raise DrakeTeleopError(
-                "delivers no joint positions for --model",
-                where=address if motion is None else motion,
-                remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
-            )
-        return ReadingStreams(*opened[:-1], PoseSourceFromJoints(opened[-1], arm))
+        if arm is not None:
+            if JOINTS not in opened[-1].streams:
+                raise DrakeTeleopError(
+                    "delivers no joint positions for --model",
+                    where=address if motion is None else motion,
+                    remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
+                )
+            opened[-1] = PoseSourceFromJoints(opened[-1], arm)
+        return ReadingStreams(*opened)
     except BaseException:
         for each in opened:
             each.close()

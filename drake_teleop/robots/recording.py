@@ -76,7 +76,8 @@ class Recorder:
         self._largest = np.full(6, np.inf) if largest is None else largest
         self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
         self._p_FS = X_FS[4:]
-        self.log_file_name, self.file_names = "log.parquet", ("log.parquet",)
+        self.log_file_name = "log.parquet"
+        self.file_names: tuple[str, ...] = ("log.parquet",)
         if WRENCH_AND_MOTION not in streams:
             self.log_file_name = "log.yaml"
             self.file_names = "log.yaml", *(f"{each}.parquet" for each in _LOG_COLUMNS_OF_STREAM)

@@ -18,10 +18,14 @@ from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
 from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.report import ReportCurves, print_tables, write_report
+from drake_teleop.lab.analysis.report import (
+    ReportCurves,
+    print_tables,
+    verdict_sentences,
+    write_report,
+)
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
-from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig

@@ -197,10 +197,8 @@ def _add_gain_extremes(angles, poles, zeros):
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_NUM_GOLDEN_SECTION_STEPS):
                 a, b = (high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low))
-                at_a, at_b = (
-                    _response_at(zeros, poles, a, 1.0),
-                    _response_at(zeros, poles, b, 1.0),
-                )
+                at_a = _response_at(zeros, poles, a, 1.0)
+                at_b = _response_at(zeros, poles, b, 1.0)
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:

@@ -43,10 +43,8 @@ class Linearization:
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
-        rows, columns = (
-            self._find_component_indices(outputs, self.outputs),
-            self._find_component_indices(inputs, self.inputs),
-        )
+        rows = self._find_component_indices(outputs, self.outputs)
+        columns = self._find_component_indices(inputs, self.inputs)
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
         A = self.A + self.B[:, columns] @ self.C[list(rows)]

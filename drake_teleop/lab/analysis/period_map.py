@@ -112,8 +112,8 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
 
     `frequency` (N,) [rad/s]: positive, below half the hand's rate.
     """
-    hand = {"hand_mass": 0.0, "hand_damping": 0.0, "hand_stiffness": 0.0}
-    bare = replace(axis, wall_stiffness=0.0, wall_damping=0.0, **hand)
+    bare = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
+    bare = replace(bare, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0)
     model = cut_axis_model(bare, sampling)
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     delay_factor = np.exp(-1j * w * model.dt * delay_in_hand_periods(axis, sampling))

@@ -115,11 +115,10 @@ class DesignProblem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        joints, g = self._evaluate_motion(x), self._gradients
+        joints, g, criterion = self._evaluate_motion(x), self._gradients, self.task.criterion
         g[0] = 0.0
-        value, g_V = self.task.criterion.smooth_log_and_gradient(
-            *self._vectors, criterion_sharpness
-        )
+        s, omega, alpha = self._vectors
+        value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
         criterion_gradient(self.task.arm_table, self._motions, *joints[1:], g_V, g[0])
         smooth, largest = self._limit_uses(joints, limit_sharpness, g[1:])
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
@@ -146,7 +145,8 @@ class DesignProblem:
 
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""
-        return self.task.criterion.value(*self._vectors, self.task.period_s)
+        s, omega, alpha = self._vectors
+        return self.task.criterion.value(s, omega, alpha, self.task.period_s)
 
     def _gradients_by_unknowns(self) -> Array:
         g = self._gradients

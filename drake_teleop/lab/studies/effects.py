@@ -53,10 +53,8 @@ class Factorial:
         of points to means over the used combinations of the other factors' levels.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
-        (row, rows), (column, columns) = (
-            self._combination_indices(shown),
-            self._combination_indices(others),
-        )
+        row, rows = self._combination_indices(shown)
+        column, columns = self._combination_indices(others)
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
         is_compared, combinations = largest_complete_block(point >= 0)
@@ -319,7 +317,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
     fields = [factor.field for factor in study.factors]
     points = rows.unique("point", keep="first").sort("point").select("point", *fields)
     tables = {name: values_by_seed(rows, name) for name in PARETO_MEASURES}
-    complete = np.isfinite([*tables.values()]).all(axis=(0, 2))
+    complete = np.all(np.isfinite([*tables.values()]), axis=(0, 2))
     for name, table in tables.items():
         mean, half = means_and_half_widths_over_seeds(table)
         points = points.with_columns(pl.Series(name, mean), pl.Series(f"{name}_half", half))
