@@ -131,24 +131,19 @@ def design_shortest_motion(
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
-            vain_rounds = (
-                0
-                if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
-                else vain_rounds + 1
-            )
+            vain_rounds += 1
+            if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period:
+                vain_rounds = 0
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
-        new_factor = factor * (reached / modelled)
+        last_factor, factor = factor, factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
-        factor = (
-            _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
-            if worst > 1.0 and k > 0
-            else new_factor
-        )
+        if worst > 1.0 and k > 0:
+            factor = _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
     raise DrakeTeleopError(
