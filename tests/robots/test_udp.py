@@ -164,7 +164,8 @@ def test_wrench_and_pose_in_a_packet() -> None:
     assert source._socket.getsockname()[0] == "127.0.0.1"
     found = source.read(5.0)
     source.close()
-    assert found is not None and [part[:3] for part in found[:2]] == [wrench[:3], pose[:3]]
+    assert found is not None and [part[:2] for part in found[:2]] == [wrench[:2], pose[:2]]
+    assert [part.stream for part in found] == [WRENCH, POSE, WRENCH, WRENCH]
     np.testing.assert_array_equal(found[0].values, -wrench.values)
     np.testing.assert_array_equal(found[1].values, pose.values)
     assert [part.flags for part in found] == [
