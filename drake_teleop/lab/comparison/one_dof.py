@@ -109,11 +109,11 @@ class OneDofRun:
     """
 
     t: Array  #: s
-    master: Array  #: m
-    slave: Array  #: m
-    command: Array  #: m, received by the slave
-    felt: Array  #: N, on the hand
-    wall: Array  #: N, on the slave
+    master_position: Array  #: m
+    slave_position: Array  #: m
+    command_position: Array  #: m, received by the slave
+    hand_force: Array  #: N, on the hand
+    wall_force: Array  #: N, on the slave
     channel_energy: Array  #: (N, 2) from hand and slave into the channel [J]
     time_without_packets: Array  #: (N, 2) time without packets of hand and slave [s]
     accounts: Array  #: (N, 4) J
@@ -242,10 +242,10 @@ def _smooth_ramp(t: Array, start: float, length: float) -> Array:
 def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
     return figures_of_traces(
         t=run.t,
-        master=run.master,
-        slave=run.slave,
-        felt=run.felt,
-        pressed=model.force_scale * model.gamma * run.wall,
+        master=run.master_position,
+        slave=run.slave_position,
+        felt=run.hand_force,
+        pressed=model.force_scale * model.gamma * run.wall_force,
         energy=run.channel_energy.sum(axis=1),
         task=task,
     )
