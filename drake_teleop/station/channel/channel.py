@@ -6,15 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
+from drake_teleop.common.blocks import all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -48,6 +42,7 @@ from drake_teleop.station.passivity.safe_state import (
     master_limits_into,
     slave_command_into,
 )
+from drake_teleop.station.stepped_block import SteppedBlock
 
 _NETWORK_CHOICES = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
@@ -114,10 +109,8 @@ _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
 _SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
-# Transformation of a wrench at the hand to the world, one array.
-_layout = SlotAllocator(11)
-_R_WB_ROWS = _layout.vector(9)  # R_WB by rows
-_MOTION_SCALES = _layout.vector(2)  # of translation and rotation
+# Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
+_R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
 _layout = SlotAllocator(PORTS_SIGNAL_SIZE)
@@ -323,7 +316,7 @@ def _convert_wrench_to_master(wrench, frame, out):
             out[3 * g + i] = total * scales[g]
 
 
-class TeleopChannel(LeafSystem):
+class TeleopChannel(SteppedBlock):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
     While the wrist sensor is saturated, the last valid wrench is used.
@@ -354,7 +347,7 @@ class TeleopChannel(LeafSystem):
         start: (7,) pose X_WS of the slave at the start.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = ()
 
     def __init__(
         self,
@@ -391,36 +384,19 @@ class TeleopChannel(LeafSystem):
         receivers, in_transit = zip(
             *(network.initial_network_state(p, carried) for p in lines), strict=True
         )
-        state = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE)]
+        results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)
-        received = np.zeros(7)
-        groups = [self.DeclareDiscreteState(part) for part in state]
-        self._groups = [int(group) for group in groups]  # faster than Drake's own indices
+        step = {self._declare_step(results, len(results) - 1, period)}
         # Packets in transit are abstract parameters, which a context clones. Drake would copy a
         # discrete state several times a step: 1.5 MB for `lunar`.
         self._in_transit = [
             self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in in_transit
         ]
-        self.DeclareStateOutputPort("pose_received", groups[3])
-        self.DeclareStateOutputPort("ports", groups[4])
-        # One step computes the present wrench and the next state.
-        step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(
-                allocate=lambda: AbstractValue.Make([*map(np.array, state), received.copy()]),
-                calc=weak_callback(self._calc_step),
-            ),
-            {self.all_input_ports_ticket(), self.xd_ticket()},
-        )
-        self._step = step.cache_index()  # the entry itself would keep the block alive
-        step_ticket = {step.ticket()}
-        self.DeclareVectorOutputPort(
-            "wrench_received", 6, weak_callback(self._calc_wrench), step_ticket
-        )
-        self.DeclareVectorOutputPort(
-            "contact_at_hand", 1, weak_callback(self._calc_contact_flag), step_ticket
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_state)
+        for name, state in (("pose_received", 3), ("ports", 4)):
+            self.DeclareStateOutputPort(name, DiscreteStateIndex(self._states[state]))
+        wrench, contact = weak_callback(self._calc_wrench), weak_callback(self._calc_contact_flag)
+        self.DeclareVectorOutputPort("wrench_received", 6, wrench, step)
+        self.DeclareVectorOutputPort("contact_at_hand", 1, contact, step)
 
     def Restart(
         self,
@@ -439,16 +415,13 @@ class TeleopChannel(LeafSystem):
             slave,
             fills,
         )
-        context.SetDiscreteState(self._groups[2], ends)
-        context.SetDiscreteState(self._groups[3], command)
+        context.SetDiscreteState(self._states[2], ends)
+        context.SetDiscreteState(self._states[3], command)
 
-    def _calc_step(self, context: Context, step: AbstractValue) -> None:
-        *state, received = step.get_mutable_value()
-        for part, group in zip(state, self._groups, strict=True):
-            part[:] = context.get_discrete_state(group).value()
+    def _advance(self, context: Context, results: list[NDArray[np.float64]]) -> None:
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
-        forward, backward = zip(state[:2], in_transit, strict=True)
+        forward, backward = zip(results[:2], in_transit, strict=True)
         load = _ZERO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
@@ -464,19 +437,11 @@ class TeleopChannel(LeafSystem):
             *self._constants,
             forward,
             backward,
-            *state[2:],
-            received,
+            *results[2:],
         )
 
-    def _evaluate_step(self, context: Context) -> list[NDArray[np.float64]]:
-        return self.get_cache_entry(self._step).Eval(context)
-
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate_step(context)[-1][_RECEIVED_WRENCH])
+        output.SetFromVector(self._step_results(context)[-1][_RECEIVED_WRENCH])
 
     def _calc_contact_flag(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._evaluate_step(context)[-1][_RECEIVED_CONTACT_FLAG]
-
-    def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._evaluate_step(context), self._groups, strict=False):
-            discrete_state.set_value(group, part)
+        output[0] = self._step_results(context)[-1][_RECEIVED_CONTACT_FLAG]
