@@ -19,6 +19,7 @@ from drake_teleop.common.config import (
     quantity,
     settings,
     unchecked_assignments,
+    with_absolute_paths,
 )
 from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.files import scenarios_dir
@@ -199,14 +200,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
     data, where = ReadScenarioData(name_or_path)
-    scenario = ScenarioFromData(data, where)
-    folder = Path(where).parent
-    scenario.slave = scenario.slave.with_absolute_paths(folder)
-    scenario.master = scenario.master.with_absolute_paths(folder)
-    scenario.environment = [
-        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
-        for thing in scenario.environment
-    ]
+    scenario: Scenario = with_absolute_paths(ScenarioFromData(data, where), Path(where).parent)
     return scenario
 
 

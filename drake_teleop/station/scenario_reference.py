@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -221,5 +222,6 @@ def _item_schema(entry: FieldInfo, block: type | None) -> dict[str, Any]:
     types = {"number": "number", "whole number": "integer", "true or false": "boolean"}
     schema: dict[str, Any] = {"type": types.get(entry.kind, "string")}
     if entry.unit:
-        schema |= {"minimum": entry.low, "maximum": entry.high}
+        limits = {"minimum": entry.low, "maximum": entry.high}
+        schema |= {name: limit for name, limit in limits.items() if limit not in (None, math.inf)}
     return schema

@@ -1,6 +1,5 @@
 """Environment from a file: SDF, URDF or Drake model directives."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,6 +36,7 @@ class Scene(Environment):
     file: str = plain(
         "door.sdf",
         ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
+        is_path=True,
     )
     position: list[float] = quantity(
         [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots of the file, in W"
@@ -63,11 +63,6 @@ class Scene(Environment):
     @property
     def hydroelastic(self) -> bool:
         return self.contact == "hydroelastic"
-
-    def with_absolute_paths(self, folder: Path) -> "Scene":
-        """Return a copy with the absolute path of `file`, if it exists in `folder`."""
-        path = (folder / self.file).resolve()
-        return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path

@@ -73,7 +73,7 @@ class Block:
 class Tool:
     """Tool, by default the paper's; a model file or a mass replaces it."""
 
-    model: str = plain("", "file of a tool: its root link is put on S")
+    model: str = plain("", "file of a tool: its root link is put on S", is_path=True)
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
