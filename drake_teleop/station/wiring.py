@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -45,6 +45,15 @@ def connect_ports(
             remedy="docs/station.md lists the ports that each side has",
         )
     builder.Connect(output, port)
+
+
+def connect_inputs(
+    builder: DiagramBuilder, block: System, sources: Mapping[str, OutputPort]
+) -> None:
+    """Connect each output port to the input port of its name in `sources`, if the block has one."""
+    for name, port in sources.items():
+        if block.HasInputPort(name):
+            builder.Connect(port, block.GetInputPort(name))
 
 
 def build_with_log(

@@ -8,6 +8,8 @@ the compiled contact law (`ToolContactModel.beyond`) each sample is an event at 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
@@ -61,7 +63,6 @@ from drake_teleop.station.sensor.sensor_chain import (
     FILTER_MEMORY_START,
     LOST_READING_FLAG_SAMPLES,
     NOISE_BLOCK_SIZE,
-    OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
@@ -87,6 +88,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     plant_rates_under_wrench,
     tool_proximity,
 )
+from drake_teleop.station.wiring import connect_inputs
 
 Array = NDArray[np.float64]
 
@@ -309,7 +311,6 @@ class WristSensor(LeafSystem):
         motion: MotionEstimationConfig,
         period: float,
         held: float,
-        q_start: Array,
         *,
         ramps: bool = False,
     ) -> None:
@@ -321,9 +322,9 @@ class WristSensor(LeafSystem):
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
-        self.offset, self.phi = constants[OFFSET_CONSTANTS], self._physics[1]
+        self.offset, self.phi = constants.offset[:6], self._physics[1]
         self.contact_pairs = self._physics[2]
-        first = sample_at_rest(arm, q_start)
+        first = sample_at_rest(arm, slave.start)
         if not config.ideal:
             first[SAMPLE_WRENCH] += config.offset
         #: Reason why contact is outside the compiled contact law, or "".
@@ -553,29 +554,21 @@ def AddCompiledWristSensor(
     motion: MotionEstimationConfig,
     period: float,
     held: float,
-    q_start: Array,
-    *,
-    ramps: bool = False,
+    torque: Mapping[str, OutputPort],
 ) -> dict[str, OutputPort]:
     """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
-    The caller must connect state, acceleration and torque of the arm.
+    `torque` contains the ports of the joint control: `joint_torque`, and `torque_rate` if it ramps.
     """
-    sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
+    sensor = WristSensor(slave, config, motion, period, held, ramps="torque_rate" in torque)
     builder.AddNamedSystem("wrist_sensor", sensor)
+    connect_inputs(builder, sensor, slave.ports)
+    connect_inputs(builder, sensor, torque)
     if not config.ideal:
         block_s = SAMPLES_PER_NOISE_BLOCK * period
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    if slave.compiled_sheet_instance is not None:
-        sheet = slave.plant.get_state_output_port(slave.compiled_sheet_instance)
-        builder.Connect(sheet, sensor.GetInputPort("sheet_state"))
-    if slave.contact.plant_state_size:
-        builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
-    if slave.can_touch:
-        results = slave.plant.get_contact_results_output_port()
-        builder.Connect(results, sensor.GetInputPort("contact_results"))
     parts = signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")

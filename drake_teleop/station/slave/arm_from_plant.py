@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -202,6 +203,21 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
+def values_per_joint(
+    arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
+) -> Array:
+    """Return n values from n values or, with a default for none, from one for all joints."""
+    n = arm.num_joints
+    if len(values) not in ((n,) if default is None else (0, 1, n)):
+        one = "" if default is None else "one for all, or "
+        raise DrakeTeleopError(
+            f"has {len(values)} numbers, but the arm has {n} joints",
+            where=where,
+            remedy=f"give {one}{n}, for {', '.join(arm.joint_names)}",
+        )
+    return np.broadcast_to(np.array(values if len(values) else default, float), (n,)).copy()
+
+
 def fill_missing_joint_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
@@ -210,7 +226,7 @@ def fill_missing_joint_limits(
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
     about accelerations.
     """
-    n, assumptions = arm.num_joints, []
+    assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
     unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_position_limits`
@@ -235,15 +251,8 @@ def fill_missing_joint_limits(
     speed = np.where(slides, _DEFAULT_SPEED_LIMIT_M_S, _DEFAULT_SPEED_LIMIT_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
-    specified = arm.acceleration_limit
-    if acceleration:
-        if len(acceleration) not in (1, n):
-            raise DrakeTeleopError(
-                f"{len(acceleration)} acceleration limits, but {n} joints",
-                where=where,
-                remedy="give one for all joints or one for each",
-            )
-        specified = np.broadcast_to(np.array(acceleration), n).copy()
+    place = f"{where}: acceleration"
+    specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
     completed = replace(
         arm,
         lower=lower,

@@ -10,6 +10,7 @@ from pydrake.math import RotationMatrix
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, holding_torque
+from drake_teleop.station.slave.arm_from_plant import values_per_joint
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -60,13 +61,7 @@ def home_posture(arm: ArmModel, position: list[float]) -> Array:
 def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     if not slave.home:
         return home_posture(arm, slave.position)
-    if len(slave.home) != arm.num_joints:
-        raise DrakeTeleopError(
-            f"{len(slave.home)} joint positions are given for {arm.num_joints} joints",
-            where="slave.home",
-            remedy=f"give one for each of {', '.join(arm.joint_names)}",
-        )
-    q = np.array(slave.home, dtype=np.float64)
+    q = values_per_joint(arm, slave.home, "slave.home")
     outside = (q < arm.lower) | (q > arm.upper)
     if outside.any():
         k = int(outside.argmax())

@@ -16,7 +16,7 @@ from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -26,11 +26,12 @@ from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
     fill_missing_joint_limits,
+    values_per_joint,
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.home import R_WS_HOME, check_holding_torque, find_start_posture
-from drake_teleop.station.slave.joint_friction import JointFriction, expand_friction_per_joint
+from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
@@ -90,8 +91,20 @@ class SlavePlant:
         return carried.table, carried.phi_load_view, *laws, no_wrenches
 
     @property
+    def ports(self) -> dict[str, OutputPort]:
+        """Output ports of the plant by the names of the input ports of other blocks."""
+        plant, leaf = self.plant, self.contact.leaf_instance
+        ports = {
+            "slave_state": plant.get_state_output_port(self.instance),
+            "slave_acceleration": plant.get_generalized_acceleration_output_port(self.instance),
+            "plant_state": plant.get_state_output_port(),
+            "contact_results": plant.get_contact_results_output_port(),
+        }
+        return ports if leaf is None else ports | {"sheet_state": plant.get_state_output_port(leaf)}
+
+    @property
     def joint_friction(self) -> Array:
-        return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
+        return values_per_joint(self.arm, self.config.friction, "slave.friction", 0.0)
 
     @property
     def can_touch(self) -> bool:
@@ -173,7 +186,7 @@ def AddSlavePlant(
     start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         check_holding_torque(arm, start)
-    friction = expand_friction_per_joint(slave.friction, arm.joint_names)
+    friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
         block = builder.AddNamedSystem("joint_friction", law)
