@@ -43,7 +43,6 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
 from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
-from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
     MinimumJerk,
@@ -281,7 +280,9 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
-    master.GetSubsystemByName("master_device")._constants[0][HAND_MASS_SLOT] = 0.0
+    device = master.GetSubsystemByName("master_device")
+    parameters, *scratch = device._constants
+    device._constants = (parameters._replace(hand_mass=0.0), *scratch)
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_recorded_signals(simulator, SETTLE)
 

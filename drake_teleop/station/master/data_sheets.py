@@ -5,30 +5,15 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.registry import Registry
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HALF_WORKSPACE_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    INERTIA_SLOT,
-    IS_IN_TASK_SPACE_SLOT,
-    MASS_SLOT,
-    MAX_ROTATION_SLOTS,
-    NUM_DEVICE_PARAMETERS,
-    PEAK_FORCE_SLOT,
-    PEAK_TORQUE_SLOTS,
-    WORKSPACE_CENTRE_SLOTS,
-)
+from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
@@ -152,25 +137,32 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
-        parameters = np.zeros(NUM_DEVICE_PARAMETERS)
-        parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            parameters[DRY_FRICTION_SLOTS] = self.friction.coulomb
-            parameters[DAMPING_SLOTS] = self.friction.viscous
-            parameters[PEAK_FORCE_SLOT] = PEAK_FORCE_N
-            parameters[PEAK_TORQUE_SLOTS] = PEAK_WRIST_TORQUES_N_M
-            return HapticDevice(parameters, self.model)
-        figures = self._data_sheet()
-        parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
-        parameters[DRY_FRICTION_SLOTS] = np.repeat([figures.friction, figures.friction_torque], 3)
-        parameters[DAMPING_SLOTS] = np.repeat([figures.damping, figures.turning_damping], 3)
-        parameters[PEAK_FORCE_SLOT] = figures.peak_force
-        parameters[PEAK_TORQUE_SLOTS] = figures.peak_torque
-        parameters[MASS_SLOT], parameters[INERTIA_SLOT] = figures.apparent_mass, figures.inertia
-        parameters[WORKSPACE_CENTRE_SLOTS] = figures.centre
-        parameters[HALF_WORKSPACE_SLOTS] = 0.5 * np.array(figures.size)
-        parameters[MAX_ROTATION_SLOTS] = figures.turn
-        return HapticDevice(parameters, self.model)
+            parameters = DeviceParameters(
+                hand_mass,
+                hand_inertia,
+                PEAK_FORCE_N,
+                PEAK_WRIST_TORQUES_N_M,
+                self.friction.coulomb,
+                self.friction.viscous,
+                in_task_space=False,
+            )
+        else:
+            figures = self._data_sheet()
+            parameters = DeviceParameters(
+                hand_mass,
+                hand_inertia,
+                figures.peak_force,
+                figures.peak_torque,
+                np.repeat([figures.friction, figures.friction_torque], 3),
+                np.repeat([figures.damping, figures.turning_damping], 3),
+                mass=figures.apparent_mass,
+                inertia=figures.inertia,
+                workspace_centre=figures.centre,
+                half_workspace=0.5 * np.array(figures.size),
+                max_rotation=figures.turn,
+            )
+        return HapticDevice(as_compiled_arguments(parameters), self.model)
 
     @property
     def is_joint_leader(self) -> bool:
@@ -212,12 +204,6 @@ class Master:
             turn_resolution=0.0,
         )
         return dataclasses.replace(self, figures=figures)
-
-    def with_absolute_paths(self, folder: Path) -> "Master":
-        """Return a copy with paths resolved from the scenario's folder."""
-        if self.leader is None:
-            return self
-        return dataclasses.replace(self, leader=self.leader.with_absolute_paths(folder))
 
     def _data_sheet(self) -> DeviceFigures:
         return self.figures or FIGURES.get(self.model, DeviceFigures())

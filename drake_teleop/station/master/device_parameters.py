@@ -1,27 +1,45 @@
-"""Parameters of a haptic device in one vector for compiled code, and its end stops."""
+"""Parameters of a haptic device for compiled code, and its end stops."""
 
 from __future__ import annotations
 
-from drake_teleop.common.compiled import njit
-from drake_teleop.station.passivity.memory import SlotAllocator
+from typing import NamedTuple
 
-NUM_DEVICE_PARAMETERS = 31  #: length of the vector
-_layout = SlotAllocator(NUM_DEVICE_PARAMETERS)
-HAND_MASS_SLOT = _layout.number()  #: mass of the hand on the grip [kg]
-HAND_INERTIA_SLOT = _layout.number()  #: inertia of the hand about every axis through E [kg m^2]
-DRY_FRICTION_SLOTS = _layout.vector(6)  #: Coulomb friction of the device's axes [N or N m]
-DAMPING_SLOTS = _layout.vector(6)  #: damping of these axes [N s/m or N m s/rad]
-PEAK_FORCE_SLOT = _layout.number()  #: largest displayed force [N]
-PEAK_TORQUE_SLOTS = _layout.vector(
-    3
-)  #: largest torque about the three rotational axes [N m]; 0: none
-IS_IN_TASK_SPACE_SLOT = _layout.number()  #: 1 for a device of `task_space`, 0 for the Phantom
-# Only for a device in task space:
-MASS_SLOT = _layout.number()  #: apparent mass at the grip [kg]
-INERTIA_SLOT = _layout.number()  #: apparent inertia at the grip about every axis [kg m^2]
-WORKSPACE_CENTRE_SLOTS = _layout.vector(3)  #: centre of the workspace, p_B [m]
-HALF_WORKSPACE_SLOTS = _layout.vector(3)  #: half edges of the workspace [m]
-MAX_ROTATION_SLOTS = _layout.vector(3)  #: largest yaw, pitch and roll [rad]
+import numpy as np
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
+
+
+class DeviceParameters(NamedTuple):
+    """Parameters of a haptic device; those after `in_task_space` are of a device in task space.
+
+    Attributes:
+        hand_mass: mass of the hand on the grip [kg].
+        hand_inertia: inertia of the hand about every axis through E [kg m^2].
+        peak_force: largest displayed force [N].
+        peak_torque: (3,) largest torque about the three rotational axes [N m]; 0: none.
+        dry_friction: (6,) Coulomb friction of the device's axes [N or N m].
+        damping: (6,) damping of these axes [N s/m or N m s/rad].
+        in_task_space: True for a device of `task_space`, False for the Phantom.
+        mass: apparent mass at the grip [kg].
+        inertia: apparent inertia at the grip about every axis [kg m^2].
+        workspace_centre: (3,) centre of the workspace, p_B [m].
+        half_workspace: (3,) half edges of the workspace [m].
+        max_rotation: (3,) largest yaw, pitch and roll [rad].
+    """
+
+    hand_mass: float
+    hand_inertia: float
+    peak_force: float
+    peak_torque: Array
+    dry_friction: Array = np.zeros(6)
+    damping: Array = np.zeros(6)
+    in_task_space: bool = True
+    mass: float = 0.0
+    inertia: float = 0.0
+    workspace_centre: Array = np.zeros(3)
+    half_workspace: Array = np.zeros(3)
+    max_rotation: Array = np.zeros(3)
 
 
 @njit(cache=True)

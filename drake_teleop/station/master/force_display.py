@@ -13,7 +13,7 @@ from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callb
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
+from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.dynamics import (
     HapticDeviceBase,
     gravity_torque_into,
@@ -45,10 +45,10 @@ _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
 
 @njit(cache=True)
 def _peak_wrench_of_device(parameters):
-    return np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
+    return np.array([parameters.peak_force, parameters.peak_torque.max()])
 
 
-def initial_display_state(q: Array, parameters: Array) -> Array:
+def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
     display = np.zeros(_MONITOR_SLOTS.stop)
     display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
     display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
@@ -64,10 +64,10 @@ def limit_wrench_into(wrench, parameters, J, displayed):
             return
     # hypot does not overflow.
     force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
-    scale = 1.0 if force <= parameters[PEAK_FORCE_SLOT] else parameters[PEAK_FORCE_SLOT] / force
+    scale = 1.0 if force <= parameters.peak_force else parameters.peak_force / force
     for k in range(3):
         displayed[k] = scale * wrench[k]
-    scale, peak = 1.0, parameters[PEAK_TORQUE_SLOTS]
+    scale, peak = 1.0, parameters.peak_torque
     for i in range(3):
         motor = abs(J[3, 3 + i] * wrench[3] + J[4, 3 + i] * wrench[4] + J[5, 3 + i] * wrench[5])
         if motor * scale > peak[i]:

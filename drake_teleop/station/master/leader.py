@@ -17,7 +17,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
-from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT, end_stop_force
+from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.slave.arm import (
@@ -177,14 +177,14 @@ class LeaderDevice(HapticDeviceBase):
             lower and upper limits [rad], stiffness and damping of end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        parameters: (NUM_DEVICE_PARAMETERS,) parameters for the force display.
+        parameters: parameters for the force display.
     """
 
     arm: ArmModel
     arm_without_hand: ArmModel
     joint_table: Array
     home: Array
-    parameters: Array
+    parameters: DeviceParameters
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
@@ -280,7 +280,7 @@ class LeaderArm(DeviceBlock):
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
         gravity = np.linalg.norm(device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN:][:3])
-        hand_weight = float(device.parameters[HAND_MASS_SLOT] * gravity)
+        hand_weight = float(device.parameters.hand_mass * gravity)
         constants = (*device.compiled_constants, hand_weight)
         super().__init__(period, device, q_initial, step_leader, constants)
 

@@ -30,13 +30,7 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    end_stop_force,
-)
+from drake_teleop.station.master.device_parameters import end_stop_force
 
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 
@@ -227,14 +221,14 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
+    mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
     gravity_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis_torque(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
-    _add_friction_and_end_stops(q, v, device[DRY_FRICTION_SLOTS], device[DAMPING_SLOTS], vdot)
+    _subtract_coriolis_torque(q, v, J, device.hand_mass, device.hand_inertia, vdot)
+    _add_friction_and_end_stops(q, v, device.dry_friction, device.damping, vdot)
     solve_by_cholesky(M, vdot, 6)
 
 

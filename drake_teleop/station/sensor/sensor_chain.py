@@ -12,6 +12,7 @@ low-pass is analog or mechanical (`before_noise`), or digital as in the JR3 (`af
 
 import copy
 import dataclasses
+from collections import namedtuple
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,13 +23,14 @@ from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
     copy_into,
     cross,
     cross_matrix,
-    matrix_at,
+    matrix_as_tuple,
     vector_at,
 )
 from drake_teleop.load.regressor import (
@@ -296,26 +298,19 @@ def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> NDArray[np.
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-#: Constants: offset of force and torque, which may change during a run.
-OFFSET_CONSTANTS = slice(0, 6)
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
 TRUE_JOINT_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
-# Constants: 12 offsets, 12 drifts per sample, then these.
-_DRIFT_PER_SAMPLE_START, _NOISE_STD_START, _WALK_STEP_STD_START, _RESOLUTION_START, _RANGE_START = (
-    range(12, 72, 12)
+#: Constants of the chain: those up to `range` are of 12 channels, and `offset` may change in a run.
+#: Calibrations: (6, 6) of the wrench, (2, 3, 3) of s and alpha from S into A; low-pass: (2, 5).
+_ChainConstants = namedtuple(
+    "_ChainConstants",
+    "offset drift_per_sample noise_std walk_step_std quantum range wrench_calibration"
+    " motion_calibration accelerometer_position low_pass low_pass_stage latency_samples"
+    " encoder_quantum is_ideal overload_limits",
 )
-_WRENCH_CALIBRATION = 72  # (6, 6)
-_MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s and alpha
-_ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
-_LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
-_LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
-_PATH_LATENCY_SAMPLES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER_QUANTUM = _PATH_LATENCY_SAMPLES + 3
-_IS_IDEAL = _ENCODER_QUANTUM + 1
-_OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
 _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -327,10 +322,10 @@ _DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[_ChainConstants, NDArray[np.float64]]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants.offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
@@ -339,32 +334,26 @@ def initialize_sensor_chain(
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
     latencies = config.latency_samples(period)
-    constants = np.concatenate(
-        [
-            config.offset,
-            config.acceleration_offset,
-            np.array(config.drift) * period,
-            np.zeros(6),
-            config.noise_std(),
-            config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
-            config.resolution * config.ranges(),
-            limits,
-            wrench.ravel(),
-            (force @ R_SA.T).ravel(),
-            (angular @ R_SA.T).ravel(),
-            p_SoAo_S,
-            sections.ravel(),
-            [
-                _LOW_PASS_CHOICES.index(config.low_pass),
-                *latencies,
-                config.encoder_resolution,
-                config.ideal,
-            ],
-            _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
-        ]
+    constants = _ChainConstants(
+        [*config.offset, *config.acceleration_offset],
+        np.append(np.array(config.drift) * period, np.zeros(6)),
+        config.noise_std(),
+        config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
+        config.resolution * config.ranges(),
+        limits,
+        wrench,
+        [force @ R_SA.T, angular @ R_SA.T],
+        p_SoAo_S,
+        sections,
+        _LOW_PASS_CHOICES.index(config.low_pass),
+        latencies,
+        config.encoder_resolution,
+        config.ideal,
+        _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    return as_compiled_arguments(constants), memory
 
 
 @njit(cache=True)
@@ -372,7 +361,7 @@ def are_values_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
-        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOAD_LIMITS + i]
+        good = good and abs(truth[i] + constants.offset[i]) <= constants.overload_limits[i]
     for i in range(6, truth.shape[0]):
         good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
@@ -391,7 +380,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
     angles = truth[TRUE_JOINT_ANGLES]
-    if constants[_IS_IDEAL] != 0.0:
+    if constants.is_ideal != 0.0:
         copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
         copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
         copy_into(reading, READ_ACCELERATION.start + 3, truth, SAMPLE_ANGULAR_ACCELERATION.start, 3)
@@ -406,13 +395,11 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     channels = row[:_NUM_CHANNELS]
     walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
     filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
-    sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
+    sections, place = constants.low_pass, constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
+        step = noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
         for i in range(_NUM_CHANNELS):
-            walks[i] += (
-                constants[_WALK_STEP_STD_START + i]
-                * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
-            )
+            walks[i] += constants.walk_step_std[i] * step[i]
 
     _apply_calibration_errors(constants, truth, channels)
     if place == _LOW_PASS_BEFORE_NOISE:
@@ -420,17 +407,17 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[i] + count * constants[_DRIFT_PER_SAMPLE_START + i]
+        channels[i] += constants.offset[i] + count * constants.drift_per_sample[i]
     if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[_NOISE_STD_START + i] * noise[first + i] + walks[i]
+        channels[i] += constants.noise_std[i] * noise[first + i] + walks[i]
     row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER_QUANTUM]
+    quantum = constants.encoder_quantum
     for i in range(_DELAY_LINE_ROW_SIZE, width):
         angle = angles[i - _DELAY_LINE_ROW_SIZE]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
@@ -439,7 +426,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_PATH_LATENCY_SAMPLES:_ENCODER_QUANTUM]
+    late = constants.latency_samples
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -468,21 +455,20 @@ def _apply_calibration_errors(constants, truth, out):
     for i in range(6):
         value = 0.0
         for j in range(6):
-            value += constants[_WRENCH_CALIBRATION + 6 * i + j] * wrench[j]
+            value += constants.wrench_calibration[i, j] * wrench[j]
         out[i] = value
-    r = vector_at(constants, _ACCELEROMETER_POSITION)
+    r = vector_at(constants.accelerometer_position, 0)
     at_Ao = add_cross_product(add_cross_product(s, alpha, r), omega, cross(omega, r))
-    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION), at_Ao)
-    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION + 9), alpha)
+    force, angular = constants.motion_calibration[0], constants.motion_calibration[1]
+    out[6], out[7], out[8] = apply_matrix(matrix_as_tuple(force), at_Ao)
+    out[9], out[10], out[11] = apply_matrix(matrix_as_tuple(angular), alpha)
 
 
 @njit(cache=True)
 def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum = constants[_RESOLUTION_START + i]
-        limit = constants[_RANGE_START + i]
-        value = channels[i]
+        quantum, limit, value = constants.quantum[i], constants.range[i], channels[i]
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)
         if abs(value) >= limit:
@@ -494,11 +480,10 @@ def _quantize_and_saturate(constants, first, end, channels):
 
 @njit(cache=True)
 def low_pass_in_place(sections, memory, values):
-    """Apply the second-order `sections` (5 k,) in series to `values` (n,) in place."""
+    """Apply the second-order `sections` (k, 5) in series to `values` (n,) in place."""
     n = values.shape[0]
-    for k in range(sections.shape[0] // 5):
-        b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]
-        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+    for k in range(sections.shape[0]):
+        b0, b1, b2, a1, a2 = sections[k]
         if b0 == 1.0:
             continue
         first, second = 2 * k * n, (2 * k + 1) * n
@@ -514,9 +499,8 @@ def low_pass_in_place(sections, memory, values):
 def settle_low_pass(sections, memory, values):
     """Set the memory of `low_pass_in_place` to its steady state at `values` (n,)."""
     n = values.shape[0]
-    for k in range(sections.shape[0] // 5):
-        b1, b2 = sections[5 * k + 1], sections[5 * k + 2]
-        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+    for k in range(sections.shape[0]):
+        _, b1, b2, a1, a2 = sections[k]
         for i in range(n):
             second = (b2 - a2) * values[i]
             memory[(2 * k + 1) * n + i] = second
