@@ -2,44 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.numeric import Array
 
-
-class DeviceParameters(NamedTuple):
-    """Parameters of a haptic device; those after `in_task_space` are of a device in task space.
-
-    Attributes:
-        hand_mass: mass of the hand on the grip [kg].
-        hand_inertia: inertia of the hand about every axis through E [kg m^2].
-        peak_force: largest displayed force [N].
-        peak_torque: (3,) largest torque about the three rotational axes [N m]; 0: none.
-        dry_friction: (6,) Coulomb friction of the device's axes [N or N m].
-        damping: (6,) damping of these axes [N s/m or N m s/rad].
-        in_task_space: True for a device of `task_space`, False for the Phantom.
-        mass: apparent mass at the grip [kg].
-        inertia: apparent inertia at the grip about every axis [kg m^2].
-        workspace_centre: (3,) centre of the workspace, p_B [m].
-        half_workspace: (3,) half edges of the workspace [m].
-        max_rotation: (3,) largest yaw, pitch and roll [rad].
-    """
-
-    hand_mass: float
-    hand_inertia: float
-    peak_force: float
-    peak_torque: Array
-    dry_friction: Array = np.zeros(6)
-    damping: Array = np.zeros(6)
-    in_task_space: bool = True
-    mass: float = 0.0
-    inertia: float = 0.0
-    workspace_centre: Array = np.zeros(3)
-    half_workspace: Array = np.zeros(3)
-    max_rotation: Array = np.zeros(3)
+#: Parameters of a haptic device for compiled code: mass [kg] of the hand, its inertia about every
+#: axis through E [kg m^2]; largest force [N] and torques (3,) about the rotational axes [N m], 0:
+#: none; Coulomb friction (6,) and damping (6,) of the axes. Then, for a device in `task_space`
+#: only: apparent mass and inertia at the grip, centre p_B (3,) and half edges (3,) of the workspace
+#: [m], largest yaw, pitch and roll (3,) [rad].
+DeviceParameters = namedtuple(
+    "DeviceParameters",
+    "hand_mass hand_inertia peak_force peak_torque dry_friction damping in_task_space"
+    " mass inertia workspace_centre half_workspace max_rotation",
+    defaults=(np.zeros(6), np.zeros(6), True, 0.0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3)),
+)
 
 
 @njit(cache=True)

@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections import namedtuple
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,8 @@ def pack_operator_parameters(
 
 def pack_task_parameters(task: Task) -> TaskParameters:
     start = TASK_CLASSES.index(type(task)), task.t_start, task.timeout, task.translation
-    along = np.array(task.translation) / task.target_distance
+    along: Any = np.array(task.translation) / task.target_distance
+    criteria: tuple[float, ...]
     if isinstance(task, Reach):
         packed = TaskParameters(*start, along, task.width / 2, task.dwell)
     else:
