@@ -1,8 +1,10 @@
 """Scenarios: configuration of a station as dataclasses, read from YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
 import dataclasses
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -33,16 +35,17 @@ from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
-from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
+from drake_teleop.station.master.data_sheets import FIGURES, Master
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import check_distance
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
-from drake_teleop.station.sensor.presets import preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import JointControlConfig, position_interface_of_servo
+from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.position_servo import POSITION_INTERFACES
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -244,12 +247,15 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     `where` is the file's name for messages.
     """
     check_structure(Scenario, data, where)  # before the presets are read
+
+    def find_preset(table: Mapping[str, Any], block: str, field: str) -> Any:
+        return copy.deepcopy(table.get(str((data.get(block) or {}).get(field))))
+
+    interface = find_preset(POSITION_INTERFACES, "joint_control", "servo")
     defaults = Scenario(
-        wrist_sensor=preset_of_block(data.get("wrist_sensor")),
-        master=Master(figures=data_sheet_in_settings(data.get("master"))),
-        joint_control=JointControlConfig(
-            interface=position_interface_of_servo(data.get("joint_control"))
-        ),
+        wrist_sensor=find_preset(PRESETS, "wrist_sensor", "preset") or WristSensorConfig(),
+        master=Master(figures=find_preset(FIGURES, "master", "model")),
+        joint_control=JointControlConfig(interface=interface),
     )
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)

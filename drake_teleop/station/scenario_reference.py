@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
 from drake_teleop.common.texts import format_yaml_value, parse_yaml
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
-from drake_teleop.station.sensor.presets import preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _MAX_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
@@ -113,7 +113,7 @@ def _block_lines(config: Any) -> list[str]:
     column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = None
     if isinstance(config, WristSensorConfig):
-        preset = preset_of_block({"preset": config.preset})
+        preset = PRESETS.get(config.preset, WristSensorConfig())
     lines = []
     for entry in entries:
         if entry.kind == "block":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
 import runpy
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.sensor.presets import PRESETS, preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK_SIZE,
     PARTS,
@@ -487,9 +488,9 @@ def test_invalid_sensor_is_rejected(changes, message):
 
 
 def loaded(text):
-    config = yaml_load_typed(
-        schema=WristSensorConfig, data=text, defaults=preset_of_block(yaml_load(data=text))
-    )
+    preset = PRESETS.get(yaml_load(data=text).get("preset"), WristSensorConfig())
+    defaults = copy.deepcopy(preset)
+    config = yaml_load_typed(schema=WristSensorConfig, data=text, defaults=defaults)
     check_ranges(config, "sensor")
     return config
 

@@ -142,27 +142,10 @@ def initial_state_of_ends(
 
 @njit(cache=True)
 def step_channel(
-    steps,
-    pose_command,
-    wrench_B,
-    load_B,
-    hand_B,
-    slave_pose,
-    saturated,
-    contact,
-    T,
-    timeout,
-    frame,
-    parameters,
-    forward_parameters,
-    backward_parameters,
-    forward,
-    backward,
-    ends,
-    pose_received,
-    ports,
-    wrench_received,
-):
+    steps, pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact, T, timeout,
+    frame, parameters, forward_parameters, backward_parameters, forward, backward, ends,
+    pose_received, ports, wrench_received,
+):  # fmt: skip
     """Run one step of both ends and of both directions of the network.
 
     Args:

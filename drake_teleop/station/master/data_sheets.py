@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -245,7 +244,3 @@ class Master:
 
 
 _MAX_DEVICE_PITCH_RAD = 1.5  # rad
-
-
-def data_sheet_in_settings(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -198,17 +198,11 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_RAD_S) + viscous[i] * v[i]
         stiffness = _MAIN_STOP_STIFFNESS_N_M_RAD if i < 3 else _WRIST_STOP_STIFFNESS_N_M_RAD
         damping = _MAIN_STOP_DAMPING_N_M_S_RAD if i < 3 else _WRIST_STOP_DAMPING_N_M_S_RAD
-        torque[i] += end_stop_force(
-            q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
-        )
-    five_bar = end_stop_force(
-        q[1] - q[2],
-        v[1] - v[2],
-        FIVE_BAR_RANGE_RAD[0],
-        FIVE_BAR_RANGE_RAD[1],
-        _MAIN_STOP_STIFFNESS_N_M_RAD,
-        _MAIN_STOP_DAMPING_N_M_S_RAD,
-    )
+        lower, upper = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
+        torque[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
+    (lower, upper), angle, rate = FIVE_BAR_RANGE_RAD, q[1] - q[2], v[1] - v[2]
+    stiffness, damping = _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD
+    five_bar = end_stop_force(angle, rate, lower, upper, stiffness, damping)
     torque[1] += five_bar
     torque[2] -= five_bar
 

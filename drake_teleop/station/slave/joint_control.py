@@ -1,9 +1,7 @@
 """Joint control of the slave: computed torque with position and velocity loop (paper, VI-A)."""
 
-import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -210,11 +208,6 @@ def MakeJointControl(
     if interface is None:
         return JointControl(arm, config, period, q_start)
     return PositionServo(arm, interface, period, q_start)
-
-
-def position_interface_of_servo(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the position interface that `servo` in a `joint_control` block names, or None."""
-    return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:

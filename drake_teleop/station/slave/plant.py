@@ -38,7 +38,6 @@ from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
     ToolContactModel,
-    make_empty_contact_model,
 )
 from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
@@ -131,15 +130,15 @@ def start_pose(slave: Slave) -> Array:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _cached_nominal_slave(HashableByValue(slave), written)
+    return _cached_nominal_slave(HashableByValue(slave, slave.model_files()))
 
 
 class HashableByValue:
-    """Hashable copy of settings, equal to copies with equal values."""
+    """Hashable copy of settings, equal to copies with equal values and unchanged files."""
 
-    def __init__(self, value: Any) -> None:
-        self.value, self._values = copy.deepcopy(value), repr(value)
+    def __init__(self, value: Any, files: list[Path]) -> None:
+        written = [path.stat().st_mtime_ns for path in files]
+        self.value, self._values = copy.deepcopy(value), repr((value, written))
 
     def __hash__(self) -> int:
         return hash(self._values)
@@ -149,7 +148,7 @@ class HashableByValue:
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _cached_nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
+def _cached_nominal_slave(key: HashableByValue) -> SlavePlant:
     return AddSlavePlant(DiagramBuilder(), key.value, None)
 
 
@@ -176,7 +175,7 @@ def AddSlavePlant(
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
         finalize_plant(plant)
-    contact = make_empty_contact_model()
+    contact = ToolContactModel()
     if environment is not None and surroundings is not None:
         _remove_visual_shapes(plant, scene_graph)
         frame = parsed.sensor_frame

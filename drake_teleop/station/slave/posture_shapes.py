@@ -237,14 +237,11 @@ def start_overlaps(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
-    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _cached_start_overlaps(HashableByValue((slave, parts)), written)
+    return _cached_start_overlaps(HashableByValue((slave, parts), slave.model_files()))
 
 
 @lru_cache(maxsize=4)
-def _cached_start_overlaps(
-    key: HashableByValue, _: tuple[int, ...]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _cached_start_overlaps(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)

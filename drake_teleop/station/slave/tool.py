@@ -4,21 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    Box,
-    Cylinder,
-    ProximityProperties,
-    Shape,
-    Sphere,
-)
+from pydrake.geometry import Box, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia, WeldJoint
 
 from drake_teleop.common.config import plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
+from drake_teleop.station.environment.environment import ContactMaterial
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
@@ -135,9 +129,9 @@ def AddTool(
 
 
 def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
-    surface = ProximityProperties()
-    friction = CoulombFriction(_TOOL_FRICTION_COEFFICIENT, _TOOL_FRICTION_COEFFICIENT)
-    AddContactMaterial(surface, _CONTACT_DISSIPATION_S_M, _CONTACT_STIFFNESS_N_M, friction)
+    surface = ContactMaterial(
+        _CONTACT_STIFFNESS_N_M, _CONTACT_DISSIPATION_S_M, _TOOL_FRICTION_COEFFICIENT
+    )
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)

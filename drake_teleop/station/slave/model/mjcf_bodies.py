@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from xml.etree.ElementTree import Element
 
@@ -57,9 +57,7 @@ class Joint:
 
     def transformed_by(self, X: RigidTransform) -> Joint:
         """Return a copy whose anchor and axis are transformed by X."""
-        anchor, axis = X @ self.anchor, X.rotation() @ self.axis
-        limits, ref = self.limits, self.ref
-        return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
+        return replace(self, anchor=X @ self.anchor, axis=X.rotation() @ self.axis)
 
 
 @dataclass(eq=False)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from difflib import get_close_matches
 from xml.etree.ElementTree import Element
 
 from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.repair_report import describe_frame_fault
 
-_MAX_SUGGESTED_FRAMES = 12  # names of frames in an error: the most similar ones
 _LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
 _UNBOUNDED_ACTUATOR_DYNAMICS = (
     "integrator",
@@ -34,9 +33,7 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             for top, *_ in tops
             for name in _names_of_elements(top, tag)
         }
-        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_SUGGESTED_FRAMES, cutoff=0.0)
-        remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
-        what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
+        what = "; ".join(describe_frame_fault(len(carriers), sensor, known - {""}))
         for fault in (what, *reader.meshes.inaccessible):
             mjcf.report.add_fault(fault)
         mjcf.report.raise_faults(mjcf.path)

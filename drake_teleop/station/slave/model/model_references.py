@@ -27,17 +27,8 @@ from drake_teleop.common.texts import read_yaml
 _MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50_000_000
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
-_BINARY_SUFFIXES = (
-    ".obj",
-    ".glb",
-    ".bin",
-    ".stl",
-    ".vtk",
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".ktx2",
-    ".dae",
+_BINARY_SUFFIXES = set(
+    [".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae"]
 )
 _PACKAGE_FILE_NAME = "package.xml"
 _FILE_ATTRIBUTE_NAME_PATTERN = re.compile(
