@@ -154,11 +154,7 @@ class LoadEstimator(LeafSystem):
             )
 
     def _update_estimate(
-        self,
-        estimate: Array,
-        sample: Array,
-        discrete_state: DiscreteValues,
-        time: float,
+        self, estimate: Array, sample: Array, discrete_state: DiscreteValues, time: float
     ) -> None:
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)

@@ -75,10 +75,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
     drag = _friction_force_per_speed(
-        omega,
-        device.dry_friction[3],
-        device.damping[3],
-        FRICTION_TANH_RAD_S,
+        omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_RAD_S
     )
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)

@@ -235,10 +235,7 @@ _NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
-    "place": {
-        "p_SoAo_S": [0.0] * 3,
-        "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-    },
+    "place": {"p_SoAo_S": [0.0] * 3, "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
     "low_pass": {"low_pass": "none"},
     "noise": {f"{name}_noise": 0.0 for name in _NOISY_QUANTITIES},
     "random_walk": {f"{name}_walk": 0.0 for name in _NOISY_QUANTITIES},

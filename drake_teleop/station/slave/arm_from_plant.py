@@ -47,9 +47,7 @@ _DEFAULT_TIME_TO_SPEED_LIMIT_S = 0.4
 
 
 def ArmModelFromPlant(
-    plant: MultibodyPlant,
-    model_instance: ModelInstanceIndex,
-    sensor_frame_name: str = "sensor",
+    plant: MultibodyPlant, model_instance: ModelInstanceIndex, sensor_frame_name: str = "sensor"
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 

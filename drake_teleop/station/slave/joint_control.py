@@ -152,11 +152,7 @@ class JointControl(LeafSystem):
     __slots__ = ONE_DICT
 
     def __init__(
-        self,
-        arm: ArmModel,
-        config: JointControlConfig,
-        period: float,
-        q_start: Array,
+        self, arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
     ) -> None:
         super().__init__()
         n = arm.num_joints

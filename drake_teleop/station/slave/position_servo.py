@@ -160,11 +160,7 @@ class PositionServo(LeafSystem):
     __slots__ = ONE_DICT
 
     def __init__(
-        self,
-        arm: ArmModel,
-        interface: PositionInterface,
-        period: float,
-        q_start: Array,
+        self, arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
     ) -> None:
         super().__init__()
         n = arm.num_joints

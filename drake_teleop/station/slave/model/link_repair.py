@@ -95,12 +95,7 @@ def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) 
 
 
 def _add_inertial_element(
-    link: Element,
-    pose: Element | None,
-    mass: float,
-    inertia: Array,
-    *,
-    is_sdf: bool,
+    link: Element, pose: Element | None, mass: float, inertia: Array, *, is_sdf: bool
 ) -> None:
     inertial = SubElement(link, "inertial")
     if pose is not None:
@@ -116,9 +111,7 @@ def _add_inertial_element(
         SubElement(inertial, "inertia", entries)
 
 
-def nearest_possible_inertia(
-    inertia: Array,
-) -> tuple[Array, float]:
+def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
