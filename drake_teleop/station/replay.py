@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -18,7 +17,7 @@ from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBo
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir, output_folder, write_json
-from drake_teleop.common.numeric import contact_spans
+from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.master.leader_model import Leader
@@ -45,7 +44,6 @@ from drake_teleop.station.slave.surroundings import (
     joint_positions_of_pose,
 )
 
-Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
 
 _TABLE_HEIGHT_M = 0.60
@@ -346,13 +344,9 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
         stand = part.floor_stand
         if stand is not None and stand.height > 0:
-            size, centre = (
-                (stand.size_x, stand.size_y, stand.height),
-                (stand.centre_x, stand.centre_y),
-            )
-            draw_box(
-                f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
-            )
+            size = stand.size_x, stand.size_y, stand.height
+            centre = stand.centre_x, stand.centre_y, stand.height / 2
+            draw_box(f"plinth_{k}" if k else "plinth", size, centre, _STEEL_COLOUR)
     set_plain_background(meshcat)
     aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.numeric import check_nonzero_load, finite_array
+from drake_teleop.common.numeric import Array, check_nonzero_load, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -36,8 +35,6 @@ from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_inputs, connect_ports, export_outputs
-
-Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 SLAVE_MONITOR_PERIOD_S = 0.01
@@ -249,16 +246,12 @@ def _add_slave_blocks(
     for name, port in sample.items():
         builder.ExportOutput(port, name)
 
-    estimator = LoadEstimator(
-        scenario.load_estimator,
-        sensor.wrench_std(),
-        estimated_motion_std(motion, sensor, arm.num_joints, sensor_period),
-        1 / rates.estimator_hz,
-        sample["sample"].size(),
-        np.zeros(16) if load_estimate is None else load_estimate,
-        load_covariance,
-        scenario.force_scaling.gripper_phi,
-    )
+    motion_std = estimated_motion_std(motion, sensor, arm.num_joints, sensor_period)
+    sampling = 1 / rates.estimator_hz, sample["sample"].size()
+    initial = np.zeros(16) if load_estimate is None else load_estimate, load_covariance
+    config, gripper = scenario.load_estimator, scenario.force_scaling.gripper_phi
+    noise = sensor.wrench_std(), motion_std
+    estimator = LoadEstimator(config, *noise, *sampling, *initial, gripper)
     builder.AddNamedSystem("load_estimator", estimator)
     # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:

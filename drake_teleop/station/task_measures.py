@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.operator.decision import (
     CONTACT_PERCEIVED_INDEX,
     OUTCOME_INDEX,
@@ -24,8 +25,6 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
-
-Array = NDArray[np.float64]
 
 _SLOT_FLOOR_TOLERANCE_M = 2e-3  # m
 _PHASE_TEXTS = {

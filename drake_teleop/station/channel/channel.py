@@ -4,7 +4,6 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
@@ -12,6 +11,7 @@ from drake_teleop.common.blocks import all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
@@ -126,9 +126,7 @@ _MIN_DELAY_STEPS = 1
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
 
-def initial_state_of_ends(
-    method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_FINITE_MASTER_POSE][:7] = ends[_LAST_FINITE_SLAVE_POSE][:7] = start
@@ -336,10 +334,10 @@ class TeleopChannel(SteppedBlock):
         self,
         channel: Channel,
         passivity: PassivityConfig,
-        R_WB: NDArray[np.float64],
-        scales: NDArray[np.float64],
+        R_WB: Array,
+        scales: Array,
         force_scale: float,
-        start: NDArray[np.float64],
+        start: Array,
         period: float,
         seed: int,
     ) -> None:
@@ -381,47 +379,31 @@ class TeleopChannel(SteppedBlock):
         self.DeclareVectorOutputPort("wrench_received", 6, wrench, step)
         self.DeclareVectorOutputPort("contact_at_hand", 1, contact, step)
 
-    def Restart(
-        self,
-        context: Context,
-        command: NDArray[np.float64],
-        slave: NDArray[np.float64],
-        fills: float,
-    ) -> None:
+    def Restart(self, context: Context, command: Array, slave: Array, fills: float) -> None:
         """Restart the channel in a running station, without packets, at a constant slave command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_FINITE_SLAVE_POSE][:7], ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = (
-            slave,
-            fills,
-        )
+        ends[_LAST_FINITE_SLAVE_POSE][:7] = slave
+        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fills
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)
 
-    def _advance(self, context: Context, results: list[NDArray[np.float64]]) -> None:
+    def _advance(self, context: Context, results: list[Array]) -> None:
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
         forward, backward = zip(results[:2], in_transit, strict=True)
         load = _ZERO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
-        step_channel(
-            self._steps,
-            self._pose.Eval(context),
-            self._wrench.Eval(context),
-            load,
-            self._hand.Eval(context),
-            self._slave.Eval(context),
-            self._saturated.Eval(context)[0] > 0.5,
-            self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
-            *self._constants,
-            forward,
-            backward,
-            *results[2:],
-        )
+        hand_and_slave = self._hand.Eval(context), self._slave.Eval(context)
+        inputs = self._pose.Eval(context), self._wrench.Eval(context), load, *hand_and_slave
+        saturated = self._saturated.Eval(context)[0] > 0.5
+        contact = self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0
+        states = *self._constants, forward, backward, *results[2:]
+        step_channel(self._steps, *inputs, saturated, contact, *states)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._step_results(context)[-1][_RECEIVED_WRENCH])

@@ -136,21 +136,15 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
+        hand = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            parameters = DeviceParameters(
-                hand_mass,
-                hand_inertia,
-                PEAK_FORCE_N,
-                PEAK_WRIST_TORQUES_N_M,
-                self.friction.coulomb,
-                self.friction.viscous,
-                in_task_space=False,
-            )
+            peaks, friction = (PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M), self.friction
+            resistance = friction.coulomb, friction.viscous
+            parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
             figures = self._data_sheet()
             parameters = DeviceParameters(
-                hand_mass,
-                hand_inertia,
+                *hand,
                 figures.peak_force,
                 figures.peak_torque,
                 np.repeat([figures.friction, figures.friction_torque], 3),
@@ -195,13 +189,9 @@ class Master:
             return dataclasses.replace(self, friction=friction)
         if self.leader is not None:
             return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
-        figures = dataclasses.replace(
-            self._data_sheet(),
-            friction=0.0,
-            friction_torque=0.0,
-            resolution=0.0,
-            turn_resolution=0.0,
-        )
+        names = ("friction", "friction_torque", "resolution", "turn_resolution")
+        exact: Any = dict.fromkeys(names, 0.0)
+        figures = dataclasses.replace(self._data_sheet(), **exact)
         return dataclasses.replace(self, figures=figures)
 
     def _data_sheet(self) -> DeviceFigures:

@@ -162,16 +162,9 @@ class DeviceBlock(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
 
     def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
-        self._advance(
-            *self._constants,
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(2),
-            discrete_state.get_mutable_value(3),
-            self._hand_wrench.Eval(context),
-            self._drive.Eval(context),
-            self._period,
-        )
+        states = [discrete_state.get_mutable_value(group) for group in range(4)]
+        inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
+        self._advance(*self._constants, *states, *inputs, self._period)
 
 
 class ForceDisplay(LeafSystem):
@@ -218,14 +211,9 @@ class ForceDisplay(LeafSystem):
         return wrench
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
-        step_display(
-            self._wrench_to_display(context),
-            self._device.Eval(context),
-            self._parameters,
-            self._period,
-            self._jacobian,
-            output.get_mutable_value(),
-        )
+        inputs = self._wrench_to_display(context), self._device.Eval(context)
+        constants = self._parameters, self._period, self._jacobian
+        step_display(*inputs, *constants, output.get_mutable_value())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])

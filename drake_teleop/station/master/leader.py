@@ -35,16 +35,8 @@ from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 
 # Rows of `LeaderDevice.joint_table`.
-(
-    _COULOMB_ROW,
-    _DAMPING_ROW,
-    _MIN_Q_ROW,
-    _MAX_Q_ROW,
-    _STOP_STIFFNESS_ROW,
-    _STOP_DAMPING_ROW,
-    _TORQUE_LIMIT_ROW,
-    _CARRIED_WEIGHT_SHARE_ROW,
-) = range(8)
+_COULOMB_ROW, _DAMPING_ROW, _MIN_Q_ROW, _MAX_Q_ROW, _STOP_STIFFNESS_ROW = range(5)
+_STOP_DAMPING_ROW, _TORQUE_LIMIT_ROW, _CARRIED_WEIGHT_SHARE_ROW = range(5, 8)
 # Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED): a slower joint creeps.
 FRICTION_TANH_SPEED = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.

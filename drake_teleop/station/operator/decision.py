@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
-from drake_teleop.common.numeric import as_compiled_arguments
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.station.operator.minimum_jerk import (
     PLAN_SIZE,
     PLAN_START_INDEX,
@@ -41,8 +40,6 @@ from drake_teleop.station.operator.task import (
     Reach,
     Task,
 )
-
-Array = NDArray[np.float64]
 
 DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
@@ -119,15 +116,8 @@ def pack_task_parameters(task: Task) -> TaskParameters:
 PHASE_INDEX, OUTCOME_INDEX, CONTACT_PERCEIVED_INDEX = range(3)
 FORCE_THRESHOLD_INDEX, CONTACT_TRUST_INDEX, STATE_SIZE = range(3, 6)
 """Indices of the signal task_state, and its size."""
-(
-    PHASE_WAITING,
-    PHASE_MOVING,
-    PHASE_APPROACHING,
-    PHASE_STOPPING,
-    PHASE_PRESSING,
-    PHASE_SEARCHING_SLOT,
-    PHASE_OVER,
-) = range(7)
+PHASE_WAITING, PHASE_MOVING, PHASE_APPROACHING, PHASE_STOPPING = range(4)
+PHASE_PRESSING, PHASE_SEARCHING_SLOT, PHASE_OVER = range(4, 7)
 """Phases: before the start; move by vision; careful approach until contact; stop; force control;
 search for the slot; finished or given up."""
 # Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
@@ -156,10 +146,8 @@ _FLOOR_DEPTH_SHARE = 0.8  # share of the depth beyond which contact counts as th
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_CRITERION_MET_SINCE], memory[_ASSUMED_CONTACT_STIFFNESS] = (
-        -1.0,
-        _INITIAL_ASSUMED_STIFFNESS,
-    )
+    memory[_CRITERION_MET_SINCE] = -1.0
+    memory[_ASSUMED_CONTACT_STIFFNESS] = _INITIAL_ASSUMED_STIFFNESS
     memory[PLAN_START_INDEX + 1] = 1.0
     return memory
 
@@ -338,10 +326,9 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
+        speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
         for i in range(3):
-            velocity_W[i] = (
-                state[CONTACT_TRUST_INDEX] * person.approach_speed * task.approach_axis[i]
-            )
+            velocity_W[i] = speed_W * task.approach_axis[i]
         _convert_to_hand_motion(person, velocity_W, speed)
         plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
         for i in range(3):

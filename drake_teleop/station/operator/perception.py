@@ -9,14 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import broadcast_to_rows, finite_array
-
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])

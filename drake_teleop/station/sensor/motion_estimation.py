@@ -11,12 +11,11 @@ from collections import namedtuple
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import as_compiled_arguments
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -113,7 +112,7 @@ class PathDelays:
 
 def steady_state_kalman_gains(
     position_std: float, acceleration_std: float, drift: float, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
 
     The Kalman filter has a measured position x, and an acceleration a with a drifting error.
@@ -154,7 +153,7 @@ def path_delays(
 
 def fusion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
@@ -168,7 +167,7 @@ def fusion_gains(
 
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
@@ -192,9 +191,7 @@ def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
     return float(rounding * np.sqrt(num_joints / 3.0))
 
 
-def _accelerometer_std(
-    sensor: WristSensorConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _accelerometer_std(sensor: WristSensorConfig) -> tuple[Array, Array]:
     """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer_pose()
@@ -206,7 +203,7 @@ def _accelerometer_std(
 
 def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[_EstimatorConstants, NDArray[np.float64]]:
+) -> tuple[_EstimatorConstants, Array]:
     """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
@@ -230,7 +227,7 @@ def initialize_motion_estimator(
 
 def _angle_low_pass_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     filters = np.zeros((_NUM_ANGLE_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
@@ -247,7 +244,7 @@ def _angle_low_pass_sections(
     return filters
 
 
-def _group_delay_samples(sections: NDArray[np.float64]) -> float:
+def _group_delay_samples(sections: Array) -> float:
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
@@ -29,6 +28,7 @@ from scipy.sparse.csgraph import connected_components
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -69,8 +69,6 @@ from drake_teleop.station.sensor.sensor_chain import (
     read_sensor_into,
 )
 
-Array = NDArray[np.float64]
-
 _NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
 _DEFAULT_SAMPLING_PERIOD_S = 1e-3
@@ -79,12 +77,8 @@ _STEP_RATIO_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
 _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
-_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR, _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = (
-    12,
-    21,
-    24,
-    27,
-)
+_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
+_GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
 
@@ -421,15 +415,8 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Sens
     X_SJc = X_BS.InvertAndCompose(X_BJc)
     instance = (joint.child_body() if on_parent else joint.parent_body()).model_instance()
     gravity = plant.gravity_field().gravity_vector() * plant.is_gravity_enabled(instance)
-    geometry = np.concatenate(
-        [
-            X_BS.translation(),
-            X_BS.rotation().matrix().ravel(),
-            X_SJc.rotation().matrix().ravel(),
-            X_SJc.translation(),
-            gravity,
-            [1.0 if on_parent else -1.0],
-        ]
-    )
+    rotations = [X.rotation().matrix().ravel() for X in (X_BS, X_SJc)]
+    places = [X_BS.translation(), *rotations, X_SJc.translation()]
+    geometry = np.concatenate([*places, gravity, [1.0 if on_parent else -1.0]])
     reaction = list(plant.GetJointIndices()).index(joint.index())
     return _SensorWeld(reaction, int(S.body().index()), geometry)

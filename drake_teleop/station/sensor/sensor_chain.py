@@ -23,7 +23,7 @@ from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import as_compiled_arguments
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -155,20 +155,20 @@ class WristSensorConfig:
         0.0, "s", 0.0, 0.1, "latency of joint angles, rounded to whole samples"
     )
 
-    def noise_std(self) -> NDArray[np.float64]:
+    def noise_std(self) -> Array:
         """Return the standard deviations (12,) of white noise in raw samples, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
-    def random_walk(self) -> NDArray[np.float64]:
+    def random_walk(self) -> Array:
         """Return the standard deviations (12,) of the random walks after 1 s, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
-    def ranges(self) -> NDArray[np.float64]:
+    def ranges(self) -> Array:
         """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
         motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
         return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
-    def largest_plausible_wrench(self) -> NDArray[np.float64]:
+    def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
         share = (
             _PLAUSIBLE_RANGES_SATURATED
@@ -177,18 +177,18 @@ class WristSensorConfig:
         )
         return share * self.ranges()[:6]
 
-    def wrench_std(self) -> NDArray[np.float64]:
+    def wrench_std(self) -> Array:
         """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
-    def motion_std(self) -> NDArray[np.float64]:
+    def motion_std(self) -> Array:
         """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
-    def accelerometer_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def accelerometer_pose(self) -> tuple[Array, Array]:
         """Return position p_SoAo_S (3,) [m] and axes R_SA (3, 3) of the accelerometer."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
@@ -199,7 +199,7 @@ class WristSensorConfig:
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
-    def reading_delays(self, period: float) -> NDArray[np.float64]:
+    def reading_delays(self, period: float) -> Array:
         """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
         delays = self.latency_samples(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
@@ -257,7 +257,7 @@ def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
-def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
+def butterworth_sections(cutoff_hz: float, rate_hz: float) -> Array:
     """Return two second-order sections [b0, b1, b2, a1, a2] of a 4th-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_NUM_LOW_PASS_SECTIONS, 5))
@@ -269,9 +269,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
     return sections
 
 
-def calibration_matrices(
-    config: WristSensorConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array]:
     """Return matrices from true values to values with calibration errors; seed: `config.unit`.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
@@ -290,7 +288,7 @@ def calibration_matrices(
     return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
 
 
-def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _rotation_about_axis(axis: Array, angle: float) -> Array:
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
@@ -319,7 +317,7 @@ _DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
-) -> tuple[_ChainConstants, NDArray[np.float64]]:
+) -> tuple[_ChainConstants, Array]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
     `constants.offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.

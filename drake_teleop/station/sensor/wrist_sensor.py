@@ -29,6 +29,7 @@ from pydrake.systems.primitives import Demultiplexer, RandomSource
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     copy_into,
@@ -89,8 +90,6 @@ from drake_teleop.station.slave.plant_dynamics import (
     tool_proximity,
 )
 from drake_teleop.station.wiring import connect_inputs
-
-Array = NDArray[np.float64]
 
 #: Tolerance of equal instants, in periods.
 _EQUAL_TIME_TOLERANCE_PERIODS = 1e-6
@@ -462,20 +461,12 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        inputs = (
-            self._physics,
-            self._sensor,
-            self._period,
-            context.get_time(),
-            *seen,
-            (
-                self._torque.Eval(context),
-                self._no_rate if self._rate is None else self._rate.Eval(context),
-            ),
-            self._evaluate_applied_wrench(context),
-            self._no_noise if self._noise is None else self._noise.Eval(context),
-            context.get_discrete_state_vector().value(),
-        )
+        rate = self._no_rate if self._rate is None else self._rate.Eval(context)
+        held, applied = (self._torque.Eval(context), rate), self._evaluate_applied_wrench(context)
+        noise = self._no_noise if self._noise is None else self._noise.Eval(context)
+        memory = context.get_discrete_state_vector().value()
+        constants = self._physics, self._sensor, self._period
+        inputs = (*constants, context.get_time(), *seen, held, applied, noise, memory)
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return

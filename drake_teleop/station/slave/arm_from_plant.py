@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -242,25 +243,21 @@ def fill_missing_joint_limits(
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
     width = np.where(slides, 2 * reach, 2 * np.pi)
-    lower, upper = (
-        np.where(half_limited & np.isinf(lower), upper - width, lower),
-        np.where(half_limited & np.isinf(upper), lower + width, upper),
-    )
+    lowest = np.where(half_limited & np.isinf(lower), upper - width, lower)
+    lower, upper = lowest, np.where(half_limited & np.isinf(upper), lower + width, upper)
     speed = np.where(slides, _DEFAULT_SPEED_LIMIT_M_S, _DEFAULT_SPEED_LIMIT_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     place = f"{where}: acceleration"
     specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
-    completed = replace(
-        arm,
-        lower=lower,
-        upper=upper,
-        velocity_limit=velocity,
-        acceleration_limit=np.where(
-            _is_positive_and_finite(specified), specified, velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
-        ),
-        effort_limit=effort,
-    )
+    default = velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
+    reached = np.where(_is_positive_and_finite(specified), specified, default)
+    limits: Any = {
+        "velocity_limit": velocity,
+        "acceleration_limit": reached,
+        "effort_limit": effort,
+    }
+    completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_RANGE_RAD)
     acceleration_text = (
         f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"

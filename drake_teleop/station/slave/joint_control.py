@@ -165,13 +165,9 @@ class JointControl(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        computed_torque_into(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            *self._constants,
-            discrete_state.get_mutable_value(0),
-        )
+        inputs = self._command.Eval(context), self._state.Eval(context)
+        torque = discrete_state.get_mutable_value(0)
+        computed_torque_into(self._arm, *inputs, *self._constants, torque)
 
 
 class HeldTorque(LeafSystem):

@@ -197,20 +197,9 @@ def AddSlavePlant(
     X_WS_start = np.empty(7) if slave.home else start_pose(slave)
     if slave.home:
         pose_into(arm.table, start, X_WS_start)
-    return SlavePlant(
-        plant,
-        instance,
-        parsed.sensor_frame,
-        tool,
-        arm,
-        start,
-        X_WS_start,
-        _tip_of_tool(plant, slave, parsed, arm),
-        contact,
-        (*parsed.assumptions, *assumptions),
-        slave,
-        environment,
-    )
+    tip, texts = _tip_of_tool(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
+    parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
+    return SlavePlant(*parts, texts, slave, environment)
 
 
 @dataclass(frozen=True)
@@ -342,11 +331,8 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         tip = plant.GetFrameByName("tip", instance)
         if slave.tool is not None and tip.body().index() == parsed.tool:  # the body frame is S
             return tip.GetFixedPoseInBodyFrame().translation()
-        X_WS, X_WTip = (
-            frame.CalcPoseInWorld(plant.CreateDefaultContext())
-            for frame in (parsed.sensor_frame, tip)
-        )
-        return X_WS.InvertAndCompose(X_WTip).translation()
+        context = plant.CreateDefaultContext()
+        return tip.CalcPose(context, parsed.sensor_frame).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
     if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
         return _farthest_hull_point_along_z(hulls)

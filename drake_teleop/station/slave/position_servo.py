@@ -166,22 +166,15 @@ class PositionServo(LeafSystem):
         n = arm.num_joints
         self._arm = arm.table
         queued = round(interface.dead_time * interface.command_hz)
-        numbers = [
-            period,
-            interface.gain,
-            interface.lookahead,
+        drives, every = (
             2 * np.pi * interface.drive_bandwidth_hz,
-            round(1 / (interface.command_hz * period)),
-            queued,
-        ]
+            1 / (interface.command_hz * period),
+        )
+        numbers = [period, interface.gain, interface.lookahead, drives, round(every), queued]
         speed = np.minimum(arm.velocity_limit, interface.max_speed)
         acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)
-        self._constants = (
-            np.array(numbers),
-            np.array([speed, acceleration]),
-            arm.effort_limit,
-            np.zeros((6, n)),
-        )
+        limits = np.array([speed, acceleration]), arm.effort_limit
+        self._constants = (np.array(numbers), *limits, np.zeros((6, n)))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
@@ -191,11 +184,6 @@ class PositionServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        position_servo_torque(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            *self._constants,
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(0),
-        )
+        inputs = self._command.Eval(context), self._state.Eval(context)
+        torque, memory = (discrete_state.get_mutable_value(group) for group in range(2))
+        position_servo_torque(self._arm, *inputs, *self._constants, memory, torque)

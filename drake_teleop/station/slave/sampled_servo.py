@@ -137,12 +137,7 @@ class SampledServo(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
-        predict_torque_line(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            self._at_rest if self._sheet is None else self._sheet.Eval(context),
-            *self._constants,
-            following[:-1],
-        )
+        sheet = self._at_rest if self._sheet is None else self._sheet.Eval(context)
+        inputs = self._command.Eval(context), self._state.Eval(context), sheet
+        predict_torque_line(self._arm, *inputs, *self._constants, following[:-1])
         following[-1] = context.get_time()

@@ -32,13 +32,8 @@ from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
 _BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
-_NUM_SIZE_VALUES_OF_SHAPE = {
-    "sphere": 1,
-    "capsule": 2,
-    "cylinder": 2,
-    "ellipsoid": 3,
-    "box": 3,
-}  # numbers in size
+# Numbers in size.
+_NUM_SIZE_VALUES_OF_SHAPE = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _ROUND_ROD_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
 
@@ -212,11 +207,7 @@ class BodyReader:
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
-        elif (
-            kind in _NUM_SIZE_VALUES_OF_SHAPE
-            and not name
-            and min(size[: _NUM_SIZE_VALUES_OF_SHAPE[kind]]) <= 0.0
-        ):
+        elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"
         if fault:
             self.lost.setdefault(fault, []).append((body, given))

@@ -13,12 +13,8 @@ from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.repair_report import describe_frame_fault
 
 _LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
-_UNBOUNDED_ACTUATOR_DYNAMICS = (
-    "integrator",
-    "muscle",
-    "user",
-    "dcmotor",
-)  # dynamics whose output has no range
+# Dynamics whose output has no range.
+_UNBOUNDED_ACTUATOR_DYNAMICS = ("integrator", "muscle", "user", "dcmotor")
 
 
 def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:

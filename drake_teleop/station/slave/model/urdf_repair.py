@@ -194,9 +194,8 @@ def _has_valid_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
-    values = (
-        [] if colour is None else [parse_number(word) for word in colour.get("rgba", "").split()]
-    )
+    words = [] if colour is None else colour.get("rgba", "").split()
+    values = [parse_number(word) for word in words]
     return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
 
 
