@@ -105,11 +105,9 @@ def write_replay(
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
-        raise DrakeTeleopError(
-            f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}",
-            where="replay",
-            remedy="give the log of a station with a simulated slave",
-        )
+        what = f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}"
+        remedy = "give the log of a station with a simulated slave"
+        raise DrakeTeleopError(what, where="replay", remedy=remedy)
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time
     # Read each signal of a log on disk once, and keep only the displayed rows.
@@ -159,21 +157,19 @@ def _row_norms(vectors: Array) -> Array:
 
 def _find_logs(run: Path) -> list[Path]:
     if not os.path.exists(run):
-        raise DrakeTeleopError(
-            "there is no such file or folder", where=str(run), remedy="give the folder of a run"
-        )
+        what = "there is no such file or folder"
+        raise DrakeTeleopError(what, where=str(run), remedy="give the folder of a run")
     if run.suffix == ".parquet":
         return [run]
     if (run / "log.parquet").exists():
         return [run / "log.parquet"]
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
-        raise DrakeTeleopError(
-            "contains no log of a run",
-            where=str(run),
-            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
-            " stores measures only: run one of its points as a scenario",
+        remedy = (
+            "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+            " stores measures only: run one of its points as a scenario"
         )
+        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 
@@ -181,11 +177,8 @@ def _find_scenario(log: Path) -> Path:
     for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
         if path.exists():
             return path
-    raise DrakeTeleopError(
-        "this log has no scenario file beside it",
-        where=str(log),
-        remedy="give --scenario, a shipped one or a YAML file",
-    )
+    remedy = "give --scenario, a shipped one or a YAML file"
+    raise DrakeTeleopError("this log has no scenario file beside it", where=str(log), remedy=remedy)
 
 
 class ReplayScene:

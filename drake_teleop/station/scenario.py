@@ -171,11 +171,8 @@ class Scenario:
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
             if sum(isinstance(thing, kind) for thing in self._touchables) > 1:
-                raise DrakeTeleopError(
-                    f"the scenario has more than one {name} (one is permitted)",
-                    where=f"{where}:environment",
-                    remedy="keep one",
-                )
+                what = f"the scenario has more than one {name} (one is permitted)"
+                raise DrakeTeleopError(what, where=f"{where}:environment", remedy="keep one")
         _check_task(self, where)
         _check_integration_step(self, where)
         _check_channel(self, where)
@@ -277,11 +274,9 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
-                raise DrakeTeleopError(
-                    f"{block} is null or a text in this scenario, so it has no field {inner}",
-                    where=place,
-                    remedy=f"set the whole block {block} first",
-                )
+                what = f"{block} is null or a text in this scenario, so it has no field {inner}"
+                remedy = f"set the whole block {block} first"
+                raise DrakeTeleopError(what, where=place, remedy=remedy)
             check_field(type(config), inner, value, place)
             value = dataclasses.replace(config, **{inner: value})
         check_field(Scenario, block, value, f"scenario:{block}")
@@ -305,11 +300,9 @@ def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     fixed = simulation.integrator != "runge_kutta3"
     if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_CONTACT_STEP_S:
-        raise DrakeTeleopError(
-            f"fixed steps of {simulation.max_step:g} s are too long for contact",
-            where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
-        )
+        what = f"fixed steps of {simulation.max_step:g} s are too long for contact"
+        remedy = f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3"
+        raise DrakeTeleopError(what, where=f"{where}:simulation.max_step", remedy=remedy)
 
 
 def _check_channel(scenario: Scenario, where: str) -> None:
@@ -325,16 +318,12 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     if scenario.master.is_joint_leader and not (
         scenario.has_direct_channel and scenario.contact_detection is None
     ):
-        raise DrakeTeleopError(
-            "a leader that commands joints requires a direct channel (a network transmits poses)",
-            where=f"{where}:master.leader.leads",
-            remedy="set it to pose, or remove network, passivity and contact_detection",
-        )
+        what = "a leader that commands joints requires a direct channel (a network transmits poses)"
+        remedy = "set it to pose, or remove network, passivity and contact_detection"
+        raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) == 0.0:
-        raise DrakeTeleopError(
-            "passivity methods require kinematic scales above 0",
-            where=f"{where}:passivity.method",
-            remedy="set both scales of kinematic_scaling above 0, or method: none",
-        )
+        what = "passivity methods require kinematic scales above 0"
+        remedy = "set both scales of kinematic_scaling above 0, or method: none"
+        raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

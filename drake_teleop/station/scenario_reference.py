@@ -75,11 +75,8 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     if found != scenario and _texts_in(found) != _texts_in(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
         lost = [n for n in names if _texts_in(getattr(found, n)) != _texts_in(getattr(scenario, n))]
-        raise DrakeTeleopError(
-            f"YAML cannot represent the scenario's block {' and '.join(lost)}",
-            where=where,
-            remedy="use printable texts, numbers and lists",
-        )
+        what = f"YAML cannot represent the scenario's block {' and '.join(lost)}"
+        raise DrakeTeleopError(what, where=where, remedy="use printable texts, numbers and lists")
     write_text(path, text)
 
 

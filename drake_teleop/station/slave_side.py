@@ -132,11 +132,8 @@ def MakeSlaveSide(
 
     if scenario.contact_detection is not None:
         if noise_floor is None:
-            raise DrakeTeleopError(
-                "no noise floor given",
-                where="contact_detection",
-                remedy="pass noise_floor=identify_load(...).noise_floor",
-            )
+            remedy = "pass noise_floor=identify_load(...).noise_floor"
+            raise DrakeTeleopError("no noise floor given", where="contact_detection", remedy=remedy)
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
@@ -307,11 +304,9 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     if hasattr(estimate, "estimate"):
-        raise DrakeTeleopError(
-            f"expected 16 numbers, found {type(estimate).__name__}",
-            where="load_estimate",
-            remedy="pass the attribute .estimate of this object",
-        )
+        what = f"expected 16 numbers, found {type(estimate).__name__}"
+        remedy = "pass the attribute .estimate of this object"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
     if estimate is not None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
@@ -319,17 +314,13 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     scales = scenario.force_scaling.scales()
     needed = {*scales.load_scales} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
-        raise DrakeTeleopError(
-            "sigma and gamma differ, which requires a load estimate, but there is none",
-            where="load_estimate",
-            remedy="pass the estimate of identify_load, or set load_estimator.enabled",
-        )
+        what = "sigma and gamma differ, which requires a load estimate, but there is none"
+        remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
     if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
-        raise DrakeTeleopError(
-            "contact detection requires a load estimate, but there is none",
-            where="load_estimate",
-            remedy="pass the estimate of identify_load as load_estimate",
-        )
+        what = "contact detection requires a load estimate, but there is none"
+        remedy = "pass the estimate of identify_load as load_estimate"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
 
 
 def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:

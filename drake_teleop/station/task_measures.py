@@ -43,11 +43,9 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     """
     task = scenario.operator.task
     if task is None:
-        raise DrakeTeleopError(
-            "the scenario has no operator's task to measure",
-            where="operator.task",
-            remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
-        )
+        what = "the scenario has no operator's task to measure"
+        remedy = "give the operator a task: !Reach, !Touch, !Press or !Insert"
+        raise DrakeTeleopError(what, where="operator.task", remedy=remedy)
     state, t, ended = result["task_state"], result.t, _last_row_of_task(result)
     begun = int(np.argmax(state[:, PHASE_INDEX] != PHASE_WAITING))
     span = slice(begun, ended + 1)

@@ -86,8 +86,5 @@ def build_with_log(
 
 def _check_port_exists(port: Any, side: System, what: str) -> None:
     if not port:
-        raise DrakeTeleopError(
-            f"the block has no {what}",
-            where=side.get_name(),
-            remedy="docs/station.md lists the ports that each side has",
-        )
+        remedy = "docs/station.md lists the ports that each side has"
+        raise DrakeTeleopError(f"the block has no {what}", where=side.get_name(), remedy=remedy)

@@ -78,11 +78,9 @@ class Channel(NetworkConfig):
         if self.network == "custom":
             return own, own if self.backward is None else self.backward
         if own != NetworkConfig() or self.backward is not None:
-            raise DrakeTeleopError(
-                f"preset '{self.network}' cannot be combined with other channel fields",
-                where=f"{where}.network",
-                remedy="remove these fields, or set network: custom",
-            )
+            what = f"preset '{self.network}' cannot be combined with other channel fields"
+            remedy = "remove these fields, or set network: custom"
+            raise DrakeTeleopError(what, where=f"{where}.network", remedy=remedy)
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:

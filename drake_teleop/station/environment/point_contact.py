@@ -162,11 +162,9 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
 def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
     names = (_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY)
     if not all(shape.HasProperty("material", name) for shape in (ball, box) for name in names):
-        raise DrakeTeleopError(
-            "the contact material has no stiffness or no dissipation",
-            where="drake:proximity_properties",
-            remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
-        )
+        what = "the contact material has no stiffness or no dissipation"
+        remedy = "give drake:point_contact_stiffness and drake:hunt_crossley_dissipation"
+        raise DrakeTeleopError(what, where="drake:proximity_properties", remedy=remedy)
     (k_1, k_2), (d_1, d_2), frictions = (
         [shape.GetProperty("material", name) for shape in (ball, box)]
         for name in (*names, "coulomb_friction")

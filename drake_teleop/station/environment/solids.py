@@ -115,11 +115,9 @@ class Wall(Surface):
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
-            raise DrakeTeleopError(
-                "is the zero vector, which has no direction",
-                where=f"{where}.normal",
-                remedy="point it to where the tool comes from, such as [0, 0, 1]",
-            )
+            what = "is the zero vector, which has no direction"
+            remedy = "point it to where the tool comes from, such as [0, 0, 1]"
+            raise DrakeTeleopError(what, where=f"{where}.normal", remedy=remedy)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
@@ -145,11 +143,9 @@ class Block(Surface):
 
     def check(self, where: str) -> None:
         if 0.0 < min(self.table) < max(self.size[:2]):
-            raise DrakeTeleopError(
-                "the table is smaller than the block on it",
-                where=f"{where}.table",
-                remedy="give a larger one, or [0, 0] for none, and a !Box to stand on",
-            )
+            what = "the table is smaller than the block on it"
+            remedy = "give a larger one, or [0, 0] for none, and a !Box to stand on"
+            raise DrakeTeleopError(what, where=f"{where}.table", remedy=remedy)
 
     @property
     def floor_stand(self) -> FloorStand | None:

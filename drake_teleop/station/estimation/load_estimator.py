@@ -104,11 +104,9 @@ class LoadEstimator(LeafSystem):
     ) -> None:
         super().__init__()
         if config.watch and not config.enabled and covariance is None:
-            raise DrakeTeleopError(
-                "there is no load to monitor: none is estimated or given with a covariance",
-                where="load_estimator.watch",
-                remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
-            )
+            what = "there is no load to monitor: none is estimated or given with a covariance"
+            remedy = "set load_estimator.enabled, or pass load_estimate with load_covariance"
+            raise DrakeTeleopError(what, where="load_estimator.watch", remedy=remedy)
         self._estimator = METHODS[config.method].for_noise(
             noise_std, motion_std, forgetting=config.forgetting, bound=config.settled_bound
         )

@@ -199,31 +199,22 @@ class Master:
 
     def check(self, where: str) -> None:
         if self.model == PHANTOM_NAME and self.figures is not None:
-            raise DrakeTeleopError(
-                "the Phantom has fixed dynamics and accepts no data sheet",
-                where=f"{where}.figures",
-                remedy="leave them out, or choose another model, such as custom",
-            )
+            what = "the Phantom has fixed dynamics and accepts no data sheet"
+            remedy = "leave them out, or choose another model, such as custom"
+            raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
         if self.model != PHANTOM_NAME and self.friction != JointFriction():
-            raise DrakeTeleopError(
-                f"only the Phantom accepts joint friction, not model '{self.model}'",
-                where=f"{where}.friction",
-                remedy="leave it out, and set figures.friction and figures.damping",
-            )
+            what = f"only the Phantom accepts joint friction, not model '{self.model}'"
+            remedy = "leave it out, and set figures.friction and figures.damping"
+            raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)
         if (self.leader is None) == (self.model == LEADER_NAME):
-            raise DrakeTeleopError(
-                "`model: leader` and the settings `leader` require each other",
-                where=f"{where}.leader",
-                remedy="give both, with leader.file and leader.hand_frame, or none",
-            )
+            what = "`model: leader` and the settings `leader` require each other"
+            remedy = "give both, with leader.file and leader.hand_frame, or none"
+            raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:
             self.leader.check(f"{where}.leader")
             if self.figures is not None:
-                raise DrakeTeleopError(
-                    "the dynamics of a leader arm are from its model file, not a data sheet",
-                    where=f"{where}.figures",
-                    remedy="leave them out",
-                )
+                what = "the dynamics of a leader arm are from its model file, not a data sheet"
+                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave them out")
         if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
             raise DrakeTeleopError(
                 f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "

@@ -254,11 +254,9 @@ def inverse_kinematics(pose: Array) -> Array:
     # Two-link arm whose second link points along q3 - 90 degrees; elbow = q2 - (q3 - 90 degrees).
     cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
     if abs(cosine) > 1:
-        raise DrakeTeleopError(
-            f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m",
-            where="pose_master",
-            remedy="choose a start pose inside the device's workspace, in its base frame B",
-        )
+        what = f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m"
+        remedy = "choose a start pose inside the device's workspace, in its base frame B"
+        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
     elbow = math.acos(cosine)
     q2 = math.atan2(z, reach) + math.atan2(L2 * math.sin(elbow), L1 + L2 * math.cos(elbow))
     q3 = q2 - elbow + math.pi / 2

@@ -374,11 +374,9 @@ class Operator(LeafSystem):
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
         if not normalize_pose_into(pose, twist, self._commanded_pose):
-            raise DrakeTeleopError(
-                f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
-                where="intended_pose",
-                remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
-            )
+            what = f"the intended motion at {context.get_time():g} s is not a finite pose and twist"
+            remedy = "give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s"
+            raise DrakeTeleopError(what, where="intended_pose", remedy=remedy)
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

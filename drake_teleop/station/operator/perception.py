@@ -173,9 +173,8 @@ def perceive_contact(
     times = finite_array("t", t, len(force))
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
-        raise DrakeTeleopError(
-            "times do not increase", where="t", remedy="give at least two samples in order of time"
-        )
+        what = "times do not increase"
+        raise DrakeTeleopError(what, where="t", remedy="give at least two samples in order of time")
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.compiled_parameters(dt)
     _perceive_recorded_motion(

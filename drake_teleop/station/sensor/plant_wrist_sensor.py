@@ -313,35 +313,26 @@ def _measure_sample_into(sensor, truth, noise, memory, sample):
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
     expect_type(MultibodyPlant, plant, f"{_NAME_IN_ERRORS}: plant")
     if not plant.is_finalized():
-        raise DrakeTeleopError(
-            f"plant '{plant.get_name()}' is not finalized",
-            where=_NAME_IN_ERRORS,
-            remedy="call plant.Finalize() first",
-        )
+        what = f"plant '{plant.get_name()}' is not finalized"
+        raise DrakeTeleopError(what, where=_NAME_IN_ERRORS, remedy="call plant.Finalize() first")
     if plant not in builder.GetSystems():
-        raise DrakeTeleopError(
-            f"plant '{plant.get_name()}' is not in this builder",
-            where=_NAME_IN_ERRORS,
-            remedy="add it by builder.AddSystem(plant) first",
-        )
+        what = f"plant '{plant.get_name()}' is not in this builder"
+        remedy = "add it by builder.AddSystem(plant) first"
+        raise DrakeTeleopError(what, where=_NAME_IN_ERRORS, remedy=remedy)
 
 
 def _event_period_and_ratio(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
-        raise DrakeTeleopError(
-            f"a sampling period of {period} s is not positive and finite",
-            where=f"{_NAME_IN_ERRORS}: period",
-            remedy="give the time between samples [s]",
-        )
+        what = f"a sampling period of {period} s is not positive and finite"
+        remedy = "give the time between samples [s]"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: period", remedy=remedy)
     if step is None:
         return period or _DEFAULT_SAMPLING_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
-        raise DrakeTeleopError(
-            f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s",
-            where=f"{_NAME_IN_ERRORS}: period",
-            remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
-        )
+        what = f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s"
+        remedy = f"choose a multiple, such as {max(1, round(count)) * step:g} s"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: period", remedy=remedy)
     return step, round(count)
 
 
@@ -350,11 +341,9 @@ def _sensor_frame_and_weld(
 ) -> tuple[Frame, WeldJoint]:
     expect_type((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
-        raise DrakeTeleopError(
-            f"joint or frame '{joint_or_frame.name()}' belongs to another plant",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="pass a joint or frame of this plant",
-        )
+        what = f"joint or frame '{joint_or_frame.name()}' belongs to another plant"
+        remedy = "pass a joint or frame of this plant"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     welds = [joint for joint in _joints_of_plant(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
@@ -363,18 +352,14 @@ def _sensor_frame_and_weld(
         if len(beyond) != 1:
             names = ", ".join(f"'{joint.name()}'" for joint in beyond)
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
-            raise DrakeTeleopError(
-                f"the body '{S.body().name()}' of frame '{S.name()}' has {found}",
-                where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-                remedy="pass the WeldJoint between arm and tool",
-            )
+            what = f"the body '{S.body().name()}' of frame '{S.name()}' has {found}"
+            remedy = "pass the WeldJoint between arm and tool"
+            raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
         return S, beyond[0]
     if not isinstance(joint_or_frame, WeldJoint):
-        raise DrakeTeleopError(
-            f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="weld the tool to the arm and pass this WeldJoint",
-        )
+        what = f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld"
+        remedy = "weld the tool to the arm and pass this WeldJoint"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     parent = joint_or_frame.frame_on_parent()
     arm, _ = _arm_body_and_load(plant, joint_or_frame)
     on_parent = parent.body().index() == arm
@@ -403,11 +388,9 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
 def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
-        raise DrakeTeleopError(
-            f"the tool beyond joint '{joint.name()}' has no mass",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="give a body of the tool a SpatialInertia",
-        )
+        what = f"the tool beyond joint '{joint.name()}' has no mass"
+        remedy = "give a body of the tool a SpatialInertia"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     on_parent = joint.parent_body().index() == arm
     X_BS, X_BJc = S.GetFixedPoseInBodyFrame(), joint.frame_on_child().GetFixedPoseInBodyFrame()
     if on_parent:

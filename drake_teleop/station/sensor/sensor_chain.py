@@ -212,11 +212,9 @@ class WristSensorConfig:
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
-            raise DrakeTeleopError(
-                "is not a rotation: its rows must be orthogonal unit vectors with determinant +1",
-                where=f"{where}.R_SA",
-                remedy="give nine numbers row by row; its columns are the axes of A in S",
-            )
+            what = "is not a rotation: its rows must be orthogonal unit vectors with determinant +1"
+            remedy = "give nine numbers row by row; its columns are the axes of A in S"
+            raise DrakeTeleopError(what, where=f"{where}.R_SA", remedy=remedy)
         filtered = not self.ideal and self.low_pass != "none"
         if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
             raise DrakeTeleopError(

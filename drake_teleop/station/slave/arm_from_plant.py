@@ -139,18 +139,14 @@ def _moving_joints_to_sensor(
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
-            raise DrakeTeleopError(
-                f"the arm up to the sensor contains an unsupported {joint.type_name()} joint",
-                where=joint.name(),
-                remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
-            )
+            what = f"the arm up to the sensor contains an unsupported {joint.type_name()} joint"
+            remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
+            raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
         body = joint.parent_body()
     if not joints:
-        raise DrakeTeleopError(
-            f"no moving joint is between the world and {frame_S.name()}",
-            where="sensor_frame",
-            remedy="name a frame or link that the arm moves",
-        )
+        what = f"no moving joint is between the world and {frame_S.name()}"
+        remedy = "name a frame or link that the arm moves"
+        raise DrakeTeleopError(what, where="sensor_frame", remedy=remedy)
     return joints[::-1]
 
 
@@ -174,11 +170,8 @@ def _table_row_of_body(
             moving = joint
         body = joint.parent_body()
     if moving is not None:
-        raise DrakeTeleopError(
-            f"the joint moves on link {body.name()}, but is not between the world and the sensor",
-            where=moving.name(),
-            remedy="weld that joint",
-        )
+        what = f"the joint moves on link {body.name()}, but is not between the world and the sensor"
+        raise DrakeTeleopError(what, where=moving.name(), remedy="weld that joint")
     return rows[body.index()]
 
 
@@ -209,11 +202,9 @@ def values_per_joint(
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
-        raise DrakeTeleopError(
-            f"has {len(values)} numbers, but the arm has {n} joints",
-            where=where,
-            remedy=f"give {one}{n}, for {', '.join(arm.joint_names)}",
-        )
+        what = f"has {len(values)} numbers, but the arm has {n} joints"
+        remedy = f"give {one}{n}, for {', '.join(arm.joint_names)}"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     return np.broadcast_to(np.array(values if len(values) else default, float), (n,)).copy()
 
 

@@ -50,11 +50,8 @@ def home_posture(arm: ArmModel, position: list[float]) -> Array:
     else:
         remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
-        raise DrakeTeleopError(
-            f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
-            where="slave.position",
-            remedy=remedy,
-        )
+        what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
+        raise DrakeTeleopError(what, where="slave.position", remedy=remedy)
     return q
 
 
@@ -77,11 +74,9 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
 def check_holding_torque(arm: ArmModel, q: Array) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
-        raise DrakeTeleopError(
-            "the mass matrix is singular: the links have too little inertia",
-            where="slave.model",
-            remedy="give masses and inertias of the links, or rotor inertias of the joints",
-        )
+        what = "the mass matrix is singular: the links have too little inertia"
+        remedy = "give masses and inertias of the links, or rotor inertias of the joints"
+        raise DrakeTeleopError(what, where="slave.model", remedy=remedy)
     torque = holding_torque(arm, q)
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())

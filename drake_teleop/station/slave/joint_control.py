@@ -74,11 +74,9 @@ class JointControlConfig:
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE_SERVO_NAME and self.interface is not None:
-            raise DrakeTeleopError(
-                "the servo computed_torque has bandwidths, but no position interface",
-                where=f"{where}.interface",
-                remedy="leave it out, or choose another servo, such as position",
-            )
+            what = "the servo computed_torque has bandwidths, but no position interface"
+            remedy = "leave it out, or choose another servo, such as position"
+            raise DrakeTeleopError(what, where=f"{where}.interface", remedy=remedy)
         interface = self.position_interface
         if interface is not None:
             interface.check(f"{where}.interface", rate)

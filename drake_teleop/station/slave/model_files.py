@@ -76,11 +76,9 @@ def repair_and_parse_model(
         instances, repaired = read(parser, path, files, purpose, Path(folder.name))
         check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
-        raise DrakeTeleopError(
-            "the model has springs or other force elements, which are not supported",
-            where=str(path),
-            remedy="remove them; only motors, gravity and contact move the arm",
-        )
+        what = "the model has springs or other force elements, which are not supported"
+        remedy = "remove them; only motors, gravity and contact move the arm"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     text = "".join(each.text for each in repaired) if all(e.text for e in repaired) else ""
     return ModelInPlant(instances, merge_repaired_models(text, repaired), folder)
 

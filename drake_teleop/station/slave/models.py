@@ -76,11 +76,9 @@ def ParseModel(
     instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
-        raise DrakeTeleopError(
-            f"the joints up to the sensor belong to several models, {', '.join(names)}",
-            where=where,
-            remedy="write the chain up to the sensor as one model",
-        )
+        what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
+        remedy = "write the chain up to the sensor as one model"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     instance = next(iter(instances), frame.model_instance())
     assumptions = [*read.repaired.assumptions, *free, *held, *rotors]
     return ParsedModel(instance, frame, assumptions, read.mesh_folder)
@@ -97,11 +95,9 @@ def ParseTool(
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
         names = ", ".join(body.name() for body in roots) or "none"
-        raise DrakeTeleopError(
-            f"the tool must have one root link, but has {len(roots)}: {names}",
-            where=str(path),
-            remedy="give one tree of links; its root is welded to the sensor frame",
-        )
+        what = f"the tool must have one root link, but has {len(roots)}: {names}"
+        remedy = "give one tree of links; its root is welded to the sensor frame"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     with translate_drake_errors(path):
         assumptions = [*read.repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
@@ -113,11 +109,8 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """Parse the surroundings of an arm; return the folder of their converted meshes."""
     read = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in read.repaired.dependence_reasons.items():
-        raise DrakeTeleopError(
-            f"{name} {what}",
-            where=str(path),
-            remedy="correct it; every object that the tool could touch must be readable",
-        )
+        remedy = "correct it; every object that the tool could touch must be readable"
+        raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
     return read.mesh_folder
 
 

@@ -219,11 +219,9 @@ class ParsedSlave:
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
-            raise DrakeTeleopError(
-                f"no body with a mass is attached to {frame.name()}",
-                where="slave.tool",
-                remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
-            )
+            what = f"no body with a mass is attached to {frame.name()}"
+            remedy = "set slave.tool, or a sensor_frame between the arm and the model's own tool"
+            raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
         check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:

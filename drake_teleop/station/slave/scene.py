@@ -72,19 +72,15 @@ class Scene(Environment):
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_BODY_NAMES:
-                raise DrakeTeleopError(
-                    f"the body name {body.name()} is reserved for the station",
-                    where=str(path),
-                    remedy="give it another name in the file",
-                )
+                what = f"the body name {body.name()} is reserved for the station"
+                remedy = "give it another name in the file"
+                raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
             if not supports_pose_conversion(joint):
-                raise DrakeTeleopError(
-                    f"the joint {joint.name()} has the unsupported type {joint.type_name()}",
-                    where=str(path),
-                    remedy="use revolute, prismatic, fixed or free joints",
-                )
+                what = f"the joint {joint.name()} has the unsupported type {joint.type_name()}"
+                remedy = "use revolute, prismatic, fixed or free joints"
+                raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         attached = {joint.child_body().index() for joint in joints}
         bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)

@@ -156,11 +156,8 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
     if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
         bodies = {name: plant.get_body(index) for name, index in contact.moving_bodies.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
-        raise DrakeTeleopError(
-            f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia",
-            where="environment",
-            remedy="give it both, or fix it",
-        )
+        what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
+        raise DrakeTeleopError(what, where="environment", remedy="give it both, or fix it")
 
 
 def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:

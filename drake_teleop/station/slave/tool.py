@@ -85,23 +85,16 @@ class Tool:
 
     def check(self, where: str) -> None:
         if self.model and self.mass:
-            raise DrakeTeleopError(
-                "a model file and a mass both define the tool",
-                where=f"{where}.mass",
-                remedy="leave one of them out",
-            )
+            what = "a model file and a mass both define the tool"
+            raise DrakeTeleopError(what, where=f"{where}.mass", remedy="leave one of them out")
         if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            raise DrakeTeleopError(
-                "shapes and inertia require a mass",
-                where=f"{where}.mass",
-                remedy="give the mass, or remove them",
-            )
+            what = "shapes and inertia require a mass"
+            remedy = "give the mass, or remove them"
+            raise DrakeTeleopError(what, where=f"{where}.mass", remedy=remedy)
         if not _tool_spatial_inertia(self).IsPhysicallyValid():
-            raise DrakeTeleopError(
-                "the inertia is impossible for a rigid body",
-                where=f"{where}.inertia",
-                remedy="give entries of the tensor about the centre of mass, or leave it out",
-            )
+            what = "the inertia is impossible for a rigid body"
+            remedy = "give entries of the tensor about the centre of mass, or leave it out"
+            raise DrakeTeleopError(what, where=f"{where}.inertia", remedy=remedy)
 
 
 def end_of_tool_shapes(tool: Tool) -> list[float] | None:
