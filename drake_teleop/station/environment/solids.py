@@ -39,25 +39,13 @@ class Surface(Environment):
     """
 
     stiffness: float = quantity(
-        1e4,
-        "N/m",
-        1e2,
-        1e7,
-        "stiffness of its surface, in series with that of the other object (E)",
+        1e4, "N/m", 1e2, 1e7, "stiffness of its surface, in series with that of the other body (E)"
     )
     dissipation: float = quantity(
-        1.0,
-        "s/m",
-        0.0,
-        100.0,
-        "Hunt-Crossley dissipation d of its surface: damping k x d at depth x (E)",
+        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation d: damping k x d at depth x (E)"
     )
     friction: float = quantity(
-        0.2,
-        "1",
-        0.0,
-        2.0,
-        "friction coefficient of its surface; its mean with that of the tool applies (E)",
+        0.2, "1", 0.0, 2.0, "friction of its surface; its mean with that of the tool applies (E)"
     )
 
     @property

@@ -34,11 +34,7 @@ class ContactDetectionConfig:
 
     statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        THRESHOLD_OVER_MAX,
-        "1",
-        1.0,
-        10.0,
-        "threshold over the largest value in the identification's motion",
+        THRESHOLD_OVER_MAX, "1", 1.0, 10.0, "threshold over the largest value during identification"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(

@@ -42,21 +42,13 @@ class LoadEstimatorConfig:
         "rls", (), "recursive least squares, or total: allows for noisy accelerations", METHODS
     )
     settled_bound: float = quantity(
-        0.05,
-        "1",
-        1e-6,
-        10.0,
-        "predicted uncertainty of a settled load, relative to a natural value",
+        0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
     )
     watch: bool = plain(
         False, "freeze a settled load, or one that is given with its covariance; detect its change"
     )
     model_error: float = quantity(
-        0.0,
-        "1",
-        0.0,
-        0.5,
-        "watch: error of the wrench by gains, cross-talk and delays, as a share of it",
+        0.0, "1", 0.0, 0.5, "watch: error of the wrench by gains, cross-talk and delays, as a share"
     )
 
     def check(self, where: str) -> None:

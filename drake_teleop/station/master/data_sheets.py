@@ -54,18 +54,14 @@ class DeviceFigures:
         [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "size of the workspace along x, y, z"
     )
     centre: list[float] = quantity(
-        [0.27, 0.0, 0.03],
-        "m",
-        -2.0,
-        2.0,
-        "centre of the workspace, p_B; default: start of the scenarios",
+        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
     )
     turn: list[float] = quantity(
         [1.2, 1.2, 2.4],
         "rad",
         0.0,
         math.pi,
-        "largest yaw, pitch (up to 1.5) and roll, in both directions",
+        "largest yaw, pitch (up to 1.5), roll; both directions",
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
     turn_resolution: float = quantity(

@@ -42,11 +42,7 @@ class Leader:
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
     home: list[float] = quantity(
-        [],
-        "rad, m",
-        -1e4,
-        1e4,
-        "joint positions at the start; by default 0, or the middle of their limits",
+        [], "rad, m", -1e4, 1e4, "start positions; by default 0, or the middle of the limits"
     )
     base_rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"

@@ -99,11 +99,7 @@ class WristSensorConfig:
         [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "position of the accelerometer"
     )
     R_SA: list[float] = quantity(
-        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        "1",
-        -1.0,
-        1.0,
-        "axes of the accelerometer, row by row",
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "accelerometer axes by rows"
     )
 
     low_pass: str = choice(
@@ -124,11 +120,7 @@ class WristSensorConfig:
         [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
     )
     drift: list[float] = quantity(
-        [4e-4, -3e-4, 8.3e-4, 2e-5, -2e-5, 1e-5],
-        "N/s, N m/s",
-        -10.0,
-        10.0,
-        "thermal drift of the offset",
+        [4e-4, -3e-4, 8.3e-4, 2e-5, -2e-5, 1e-5], "N/s, N m/s", -10.0, 10.0, "thermal offset drift"
     )
     acceleration_offset: list[float] = quantity(
         [0.0] * 6, "m/s^2, rad/s^2", -100.0, 100.0, "offset of specific force, angular acceleration"

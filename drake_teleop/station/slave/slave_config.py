@@ -46,9 +46,7 @@ class Slave:
         is_path=True,
     )
     package_paths: list[str] = plain(
-        [],
-        "folders for package:// addresses in model and tool, from the scenario's folder",
-        is_path=True,
+        [], "folders of package:// addresses, from the scenario's folder", is_path=True
     )
     base_pose: list[float] = quantity(
         [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
