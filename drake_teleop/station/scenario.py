@@ -91,9 +91,7 @@ class Simulation:
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
-    end_with_task: bool = plain(
-        False, "end the run within 20 ms after the operator finishes or gives up"
-    )
+    end_with_task: bool = plain(False, "end within 20 ms after the operator finishes or gives up")
     on_fault: str = choice(
         "continue",
         ("continue", "stop"),

@@ -56,9 +56,7 @@ _TIMEOUT_PER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence o
 class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
-    network: str = choice(
-        "custom", _NETWORK_CHOICES, "a preset, or custom for the network of these fields"
-    )
+    network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
     backward: NetworkConfig | None = plain(
         None, "network from slave to master; null: as from master to slave"
     )

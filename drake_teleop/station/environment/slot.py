@@ -40,9 +40,7 @@ class Slot(Environment):
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
     )
-    yaw: float = quantity(
-        0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: it runs along x_W"
-    )
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: along x_W")
     clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
     depth: float = quantity(0.040, "m", 0.02, 0.05, "from the mouth to the floor")
     chamfer: float = quantity(

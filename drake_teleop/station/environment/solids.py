@@ -61,12 +61,8 @@ class Surface(Environment):
 class Box(Surface):
     """Fixed box with pose, size and surface."""
 
-    position: list[float] = quantity(
-        [0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, the middle of the box, in W"
-    )
-    rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of R_WBox"
-    )
+    position: list[float] = quantity([0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, its middle, in W")
+    rotation: list[float] = quantity([0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W")
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -97,9 +93,7 @@ class Wall(Surface):
     normal: list[float] = quantity(
         [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
     )
-    size: list[float] = quantity(
-        [0.4, 0.4], "m", 1e-3, 4.0, "lengths of its face; the wall is 0.1 m thick"
-    )
+    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "edges of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:

@@ -50,9 +50,7 @@ class DeviceFigures:
     peak_torque: list[float] = quantity(
         [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: measured only"
     )
-    size: list[float] = quantity(
-        [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "size of the workspace along x, y, z"
-    )
+    size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
     )
@@ -64,9 +62,7 @@ class DeviceFigures:
         "largest yaw, pitch (up to 1.5), roll; both directions",
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
-    turn_resolution: float = quantity(
-        0.0, "rad", 0.0, 0.1, "rotation step of the encoders; 0: exact"
-    )
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
     rate_hz: float = quantity(
         0.0, "Hz", 0.0, 1e5, "update rate of the device; 0 or a larger rate: rates.hand_hz"
     )

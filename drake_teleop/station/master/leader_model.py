@@ -34,9 +34,7 @@ JOINT_MODE = "joints"
 class Leader:
     """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
-    file: str = plain(
-        "", "URDF, SDF, MJCF or .dmd.yaml file, from the scenario's folder", is_path=True
-    )
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder", is_path=True)
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in it, from the scenario's folder", is_path=True
     )

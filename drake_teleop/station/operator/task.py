@@ -93,9 +93,7 @@ class Movement:
         1.5, "m/s^2", 0.01, 50.0, "peak acceleration of the hand in a submovement"
     )
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
-    noise: float = quantity(
-        0.05, "1", 0.0, 0.5, "standard deviation of the end point over the length"
-    )
+    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point over length")
     approach_speed: float = quantity(
         0.03, "m/s", 1e-3, 1.0, "speed of the tool in a careful approach, at full trust"
     )

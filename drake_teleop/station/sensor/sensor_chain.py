@@ -81,30 +81,18 @@ class WristSensorConfig:
     ideal: bool = plain(False, "true values at the sampling instant, at So in S, without all parts")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(
-        0.0, "1", 0.0, 0.1, "largest cross-talk, share of range per full range"
-    )
-    misalignment: float = quantity(
-        0.0, "rad", 0.0, 0.2, "angle from S to the real axes of the wrench"
-    )
-    acceleration_gain_error: float = quantity(
-        0.0, "1", 0.0, 0.1, "largest gain error of the accelerations"
-    )
-    acceleration_misalignment: float = quantity(
-        0.0, "rad", 0.0, 0.2, "angle from A to the real axes"
-    )
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest cross-talk in ranges per full range")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
+    acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
+    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
     unit: int = plain(0, "seed of the calibration errors within their bounds")
 
-    p_SoAo_S: list[float] = quantity(
-        [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "position of the accelerometer"
-    )
+    p_SoAo_S: list[float] = quantity([0.0, 0.0, 0.0175], "m", -1.0, 1.0, "accelerometer position")
     R_SA: list[float] = quantity(
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "accelerometer axes by rows"
     )
 
-    low_pass: str = choice(
-        "after_converter", _LOW_PASS_CHOICES, "position of the low-pass in the chain"
-    )
+    low_pass: str = choice("after_converter", _LOW_PASS_CHOICES, "low-pass position in the chain")
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
@@ -162,12 +150,9 @@ class WristSensorConfig:
 
     def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
-        share = (
-            _PLAUSIBLE_RANGES_SATURATED
-            if self.saturates and not self.ideal
-            else _PLAUSIBLE_RANGES_UNSATURATED
-        )
-        return share * self.ranges()[:6]
+        if self.saturates and not self.ideal:
+            return _PLAUSIBLE_RANGES_SATURATED * self.ranges()[:6]
+        return _PLAUSIBLE_RANGES_UNSATURATED * self.ranges()[:6]
 
     def wrench_std(self) -> Array:
         """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""

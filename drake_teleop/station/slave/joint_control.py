@@ -33,12 +33,8 @@ COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 class JointControlConfig:
     """Settings of the slave's joint control: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(
-        12.0, "Hz", 0.1, 1e4, "bandwidth of the position loop (E)"
-    )
-    velocity_bandwidth_hz: float = quantity(
-        70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
-    )
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position loop bandwidth (E)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity loop bandwidth (E)")
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
         (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACES, "position"),
@@ -64,12 +60,9 @@ class JointControlConfig:
     @property
     def position_loop_gain_per_s(self) -> float:
         """Commanded joint speed divided by the position error [1/s]."""
-        interface = self.position_interface
-        return (
-            2 * np.pi * self.position_bandwidth_hz
-            if interface is None
-            else 1 / self.tracking_delay_s
-        )
+        if self.position_interface is None:
+            return 2 * np.pi * self.position_bandwidth_hz
+        return 1 / self.tracking_delay_s
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""

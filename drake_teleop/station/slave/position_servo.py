@@ -32,9 +32,7 @@ class PositionInterface:
     """Settings of the position interface of an arm; m instead of rad for prismatic joints."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(
-        0.004, "s", 0.0, 1.0, "dead time of a command; whole periods of command_hz"
-    )
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time; whole periods of command_hz")
     gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per position error")
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
     max_speed: float = quantity(
@@ -166,10 +164,8 @@ class PositionServo(LeafSystem):
         n = arm.num_joints
         self._arm = arm.table
         queued = round(interface.dead_time * interface.command_hz)
-        drives, every = (
-            2 * np.pi * interface.drive_bandwidth_hz,
-            1 / (interface.command_hz * period),
-        )
+        drives = 2 * np.pi * interface.drive_bandwidth_hz
+        every = 1 / (interface.command_hz * period)
         numbers = [period, interface.gain, interface.lookahead, drives, round(every), queued]
         speed = np.minimum(arm.velocity_limit, interface.max_speed)
         acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)

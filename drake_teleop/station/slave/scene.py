@@ -38,9 +38,7 @@ class Scene(Environment):
         ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
         is_path=True,
     )
-    position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots of the file, in W"
-    )
+    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots, in W")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
     )
@@ -50,9 +48,7 @@ class Scene(Environment):
         ("point", "hydroelastic"),
         "Drake's contact model; shapes that are not hydroelastic use point",
     )
-    tool_modulus: float = quantity(
-        1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool's shapes (E)"
-    )
+    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
     slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property

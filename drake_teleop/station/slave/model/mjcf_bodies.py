@@ -255,11 +255,9 @@ class BodyReader:
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return ZERO_MASS_PROPERTIES
         try:
-            shape = (
-                mass_properties_of_mesh(geom.mesh)
-                if geom.mesh
-                else mass_properties_of_primitive(geom.kind, geom.size)
-            )
+            shape = mass_properties_of_primitive(geom.kind, geom.size)
+            if geom.mesh:
+                shape = mass_properties_of_mesh(geom.mesh)
         except ValueError as error:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return ZERO_MASS_PROPERTIES

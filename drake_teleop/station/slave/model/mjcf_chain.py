@@ -227,11 +227,8 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    if (
-        biased
-        or given.get("gaintype", "fixed") != "fixed"
-        or given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
-    ):
+    is_unbounded = given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
+    if biased or given.get("gaintype", "fixed") != "fixed" or is_unbounded:
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
 

@@ -123,11 +123,9 @@ def _set_mass_of_body(
         body.inertial = ZERO_MASS_PROPERTIES
         return
     properties = properties.with_mass(factor * properties.mass)
-    inertia = (
-        correct_impossible_inertia(properties.inertia, body.name, report)
-        if is_moved
-        else nearest_possible_inertia(properties.inertia)[0]
-    )
+    inertia = nearest_possible_inertia(properties.inertia)[0]
+    if is_moved:
+        inertia = correct_impossible_inertia(properties.inertia, body.name, report)
     body.inertial = properties._replace(inertia=inertia)
 
 
