@@ -15,7 +15,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.passivity import methods
+from drake_teleop.station.passivity import methods, safe_state
 from drake_teleop.station.passivity.memory import (
     CHANNEL_FILL_TIME_LEFT,
     LOAD_WRENCH,
@@ -31,16 +31,6 @@ from drake_teleop.station.passivity.packet import (
     SENDER_INPUTS_FINITE,
     dot_of_group,
     pose_difference_into,
-)
-from drake_teleop.station.passivity.safe_state import (
-    MASTER_MONITOR_SIZE,
-    SILENCE_TIME,
-    SLAVE_MONITOR_SIZE,
-    STOP_TIME_S,
-    initial_master_monitor,
-    initial_slave_monitor,
-    master_limits_into,
-    slave_command_into,
 )
 from drake_teleop.station.stepped_block import SteppedBlock
 
@@ -93,7 +83,9 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
+_ENDS_STATE_SIZE = (
+    2 + 2 * (8 + 6 + MEMORY_SIZE) + safe_state.MASTER_MONITOR_SIZE + safe_state.SLAVE_MONITOR_SIZE
+)
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
@@ -102,8 +94,8 @@ _LAST_FINITE_SLAVE_POSE = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
-_SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
+_MASTER_SILENCE_MONITOR = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
+_SLAVE_SILENCE_MONITOR = _layout.vector(safe_state.SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
 _R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
@@ -126,9 +118,9 @@ def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_FINITE_MASTER_POSE][:7] = ends[_LAST_FINITE_SLAVE_POSE][:7] = start
-    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = STOP_TIME_S
-    ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
-    ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
+    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
+    ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
+    ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
     ends[MASTER_METHOD_MEMORY] = ends[SLAVE_METHOD_MEMORY] = memory
     return ends
@@ -169,8 +161,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
-    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][safe_state.SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][safe_state.SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -198,7 +190,9 @@ def step_master_end(
         valid = False
     healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
-    master_limits_into(healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits)
+    safe_state.master_limits_into(
+        healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits
+    )
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
         packet,
@@ -234,7 +228,7 @@ def step_slave_end(
     else:
         # Blend from the kept wrench to the measured one.
         _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _convert_wrench_to_world(load_B, frame, wrench)
@@ -251,7 +245,7 @@ def step_slave_end(
         packet[SENDER_INPUTS_FINITE] = 0.0
     packet[CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
-    slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
+    safe_state.slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
     pose_difference_into(pose_received, left, dx)
     for g in range(2):

@@ -39,21 +39,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    LOST_SAMPLE_FLAG,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_JOINT_POSITION,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    SAMPLE_WRENCH_AND_MOTION,
-    SATURATION_FLAG_INDEX,
-    non_contact_wrench_into,
-    sample_size,
-    signals_of_sample,
-)
+from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -110,12 +96,12 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
-    s = out[SAMPLE_SPECIFIC_FORCE]
-    omega = out[SAMPLE_ANGULAR_VELOCITY]
-    alpha = out[SAMPLE_ANGULAR_ACCELERATION]
-    wrench = out[SAMPLE_WRENCH]
-    non_contact_wrench_into(s, omega, alpha, phi, wrench)
+    copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
+    s = out[regressor.SAMPLE_SPECIFIC_FORCE]
+    omega = out[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = out[regressor.SAMPLE_ANGULAR_ACCELERATION]
+    wrench = out[regressor.SAMPLE_WRENCH]
+    regressor.non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
     tau = minus(vector_at(contact_W, 3), cross(p_WS, f))
@@ -147,26 +133,28 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[SAMPLE_WRENCH_AND_MOTION]
+    rigid = truth[regressor.SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
     copy_into(truth, TRUE_JOINT_ANGLES.start, x, 0, n)
-    size = FIRST_JOINT_INDEX + n
+    size = regressor.FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
     if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        sample[regressor.SATURATION_FLAG_INDEX] = (
+            regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        )
         return
-    lost = sample[SATURATION_FLAG_INDEX] - 1.0
+    lost = sample[regressor.SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
+        copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
+        sample[regressor.SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
         estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= LOST_SAMPLE_FLAG:
-        sample[SATURATION_FLAG_INDEX] = lost
+    if lost >= regressor.LOST_SAMPLE_FLAG:
+        sample[regressor.SATURATION_FLAG_INDEX] = lost
 
 
 @njit(cache=True)
@@ -218,7 +206,7 @@ def take_due_samples(
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
-    size, half, tau, joints = FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
+    size, half, tau, joints = regressor.FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
     extra = around.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
@@ -325,7 +313,7 @@ class WristSensor(LeafSystem):
         self.contact_pairs = self._physics[2]
         first = sample_at_rest(arm, slave.start)
         if not config.ideal:
-            first[SAMPLE_WRENCH] += config.offset
+            first[regressor.SAMPLE_WRENCH] += config.offset
         #: Reason why contact is outside the compiled contact law, or "".
         self.reason_beyond_contact_law = contact.drake_contact_reason
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
@@ -393,9 +381,9 @@ class WristSensor(LeafSystem):
     def motion_dependent_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
-        size = sample_size(self._n)
+        size = regressor.sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTER_MEMORY_START)
-        others = [SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
+        others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
@@ -529,12 +517,12 @@ class WristSensor(LeafSystem):
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
-    sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
+    sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
     touching = np.zeros(6)
     motion = np.zeros(SENSOR_MOTION_SIZE)
-    truth = sample[SAMPLE_WRENCH_AND_MOTION]
+    truth = sample[regressor.SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
-    sample[SAMPLE_JOINT_POSITION] = q
+    sample[regressor.SAMPLE_JOINT_POSITION] = q
     return sample
 
 
@@ -560,7 +548,7 @@ def AddCompiledWristSensor(
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    parts = signals_of_sample(slave.arm.num_joints)
+    parts = regressor.signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)
