@@ -47,9 +47,7 @@ class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
     network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
-    backward: NetworkConfig | None = plain(
-        None, "network from slave to master; null: as from master to slave"
-    )
+    backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
         None,
         "s",

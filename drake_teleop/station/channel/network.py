@@ -54,9 +54,7 @@ class NetworkConfig:
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
     playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age of a packet that is used")
-    redundant: bool = plain(
-        False, "each packet repeats the samples that the playout buffer may still wait for"
-    )
+    redundant: bool = plain(False, "packets repeat the samples that the playout buffer may await")
     trace: str | None = plain(
         None,
         "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "

@@ -87,9 +87,7 @@ def AddFixedBox(
 class Wall(Surface):
     """Fixed flat wall with position, normal, size and surface."""
 
-    position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
-    )
+    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
     normal: list[float] = quantity(
         [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
     )

@@ -63,9 +63,7 @@ class DeviceFigures:
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
     turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
-    rate_hz: float = quantity(
-        0.0, "Hz", 0.0, 1e5, "update rate of the device; 0 or a larger rate: rates.hand_hz"
-    )
+    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or a larger one: rates.hand_hz")
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]

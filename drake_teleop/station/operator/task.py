@@ -73,14 +73,8 @@ TASK_CLASSES = (Reach, Touch, Press, Insert)
 
 #: Names of the measures that `station.task_measures` defines.
 TASK_MEASURE_NAMES = (
-    "success",
-    "task_time_s",
-    "contact_force_overshoot_N",
-    "effort_Ns",
-    "task_work_J",
-    "detection_time_s",
-    "false_notices",
-    "press_error_N",
+    *("success", "task_time_s", "contact_force_overshoot_N", "effort_Ns", "task_work_J"),
+    *("detection_time_s", "false_notices", "press_error_N"),
 )
 
 
@@ -89,9 +83,7 @@ TASK_MEASURE_NAMES = (
 class Movement:
     """Parameters of the operator's movements; see docs/operator.md."""
 
-    acceleration: float = quantity(
-        1.5, "m/s^2", 0.01, 50.0, "peak acceleration of the hand in a submovement"
-    )
+    acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak acceleration in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
     noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point over length")
     approach_speed: float = quantity(
