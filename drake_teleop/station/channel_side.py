@@ -55,9 +55,10 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     passivity = _adapt_passivity_to_device(scenario, passivity_with_arm_mass(scenario))
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     motion_scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    scales, start = (motion_scales, _contact_force_scale(scenario)), start_pose(scenario.slave)
-    timing = 1 / scenario.rates.hand_hz, scenario.simulation.seed
-    block = TeleopChannel(scenario.channel, passivity, R_WB, *scales, start, *timing)
+    scales = motion_scales, _contact_force_scale(scenario)
+    start, period = start_pose(scenario.slave), 1 / scenario.rates.hand_hz
+    seed = scenario.simulation.seed
+    block = TeleopChannel(scenario.channel, passivity, R_WB, *scales, start, period, seed)
     channel = builder.AddNamedSystem("channel", block)
     own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
     for name in own:

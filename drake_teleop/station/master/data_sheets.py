@@ -55,11 +55,7 @@ class DeviceFigures:
         [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
     )
     turn: list[float] = quantity(
-        [1.2, 1.2, 2.4],
-        "rad",
-        0.0,
-        math.pi,
-        "largest yaw, pitch (up to 1.5), roll; both directions",
+        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (to 1.5), roll; both directions"
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
     turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
@@ -128,8 +124,8 @@ class Master:
             return self.leader.device(self.position, hand_mass, hand_inertia)
         hand = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            peaks, friction = (PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M), self.friction
-            resistance = friction.coulomb, friction.viscous
+            peaks = PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
+            resistance = self.friction.coulomb, self.friction.viscous
             parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
         else:
             figures = self._data_sheet()
