@@ -101,12 +101,12 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
-    servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
+    stiffness, damping, mass = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity,
-        servo_stiffness=servo.stiffness,
-        servo_damping=servo.damping,
-        slave_mass=servo.mass,
+        servo_stiffness=stiffness,
+        servo_damping=damping,
+        slave_mass=mass,
     )
 
 

@@ -6,8 +6,6 @@ step; the block holds pose and velocity of this state to pair them.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from pydrake.common import RandomDistribution
 from pydrake.common.value import AbstractValue
@@ -81,12 +79,6 @@ _WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
 _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
-
-
-class _SensorWeld(NamedTuple):
-    reaction_index: int
-    body_index: int
-    geometry: Array
 
 
 def AddWristSensor(
@@ -385,7 +377,8 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
     return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
-def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
+def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple[int, int, Array]:
+    """Return the indices of reaction and body of S in the plant's ports, and the geometry."""
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         what = f"the tool beyond joint '{joint.name()}' has no mass"
@@ -402,4 +395,4 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Sens
     places = [X_BS.translation(), *rotations, X_SJc.translation()]
     geometry = np.concatenate([*places, gravity, [1.0 if on_parent else -1.0]])
     reaction = list(plant.GetJointIndices()).index(joint.index())
-    return _SensorWeld(reaction, int(S.body().index()), geometry)
+    return reaction, int(S.body().index()), geometry

@@ -1,7 +1,6 @@
 """Joint control of the slave: computed torque with position and velocity loop (paper, VI-A)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -220,32 +219,19 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
     return np.linalg.inv(J @ mobility @ J.T)
 
 
-class ServoAtTool(NamedTuple):
-    """Joint servo as an equivalent wrench at the tool, K (x_command - x) - D v.
+def servo_at_tool(
+    arm: ArmModel, q: Array, config: JointControlConfig
+) -> tuple[list[float], list[float], list[float]]:
+    """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
 
-    Attributes:
-        stiffness: (2,) K of translation and rotation [N/m, N m/rad].
-        damping: (2,) D of translation and rotation [N s/m, N m s/rad].
-        mass: (2,) mass and inertia of arm and tool [kg, kg m^2].
-    """
-
-    stiffness: list[float]
-    damping: list[float]
-    mass: list[float]
-
-
-def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
-    """Return stiffness, damping and mass of the slave at the tool, for the passivity methods.
-
-    Mass m and inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is
-    that of the largest eigenvalues of its two blocks, their size the smallest possible.
+    The servo is then the wrench K (x_command - x) - D v, for translation and rotation. Mass m and
+    inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is that of the
+    largest eigenvalues of its two blocks, their size the smallest possible.
     """
     config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)
     blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
     unit = 1 / np.sqrt(np.repeat(blocks, 3))
     mass = np.linalg.eigvalsh(unit[:, np.newaxis] * inertia * unit)[-1] * np.array(blocks)
-    kp, kv = (
-        2 * np.pi * hertz for hertz in (config.position_bandwidth_hz, config.velocity_bandwidth_hz)
-    )
-    return ServoAtTool((kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist())
+    kp, kv, *_ = servo_gains_and_limits(arm, config)
+    return (kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist()
