@@ -84,18 +84,14 @@ class Simulation:
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
     settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
     integrator: str = choice(
-        "runge_kutta3",
-        ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"),
-        "Drake's name of the integration scheme",
+        "runge_kutta3", ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"), "Drake's scheme"
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
     end_with_task: bool = plain(False, "end within 20 ms after the operator finishes or gives up")
     on_fault: str = choice(
-        "continue",
-        ("continue", "stop"),
-        "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
+        "continue", ("continue", "stop"), "after a fault: go on in a safe state, or end in an error"
     )
 
 

@@ -178,15 +178,11 @@ def _titles_of_blocks(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
 
 def _links_to_blocks(entry: FieldInfo, path: str) -> str:
     several = len(entry.blocks) > 1
-    links = [
-        f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor_of_title(title)})"
-        for title, block in _titles_of_blocks(entry, path)
-    ]
+    links = []
+    for title, block in _titles_of_blocks(entry, path):
+        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+        links.append(f"[{f'!{block.__name__}' if several else 'block'}](#{anchor})")
     return f"{'list of ' * entry.list_depth}{', '.join(links)}{', or null' * entry.optional}"
-
-
-def _anchor_of_title(title: str) -> str:
-    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
 def _object_schema(config: Any) -> dict[str, Any]:

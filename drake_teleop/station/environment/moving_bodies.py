@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
-from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -80,8 +79,8 @@ def _joint_table_row(plant: MultibodyPlant, context: Context, joint: Joint, row:
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _joint_type_and_axis(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
-    poses = [number for X in (X_PF, X_MB) for number in _pose_as_quaternion_and_position(X)]
-    return np.array([row, kind, *places, *axis, *poses])
+    poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
+    return np.array([row, kind, *places, *axis, *poses[0], *poses[1]])
 
 
 def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
@@ -90,10 +89,6 @@ def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, PrismaticJoint):
         return _PRISMATIC_JOINT, joint.translation_axis()
     return _FREE_JOINT if isinstance(joint, QuaternionFloatingJoint) else _FIXED_JOINT, np.zeros(3)
-
-
-def _pose_as_quaternion_and_position(X: RigidTransform) -> Array:
-    return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
 
 
 @njit(cache=True)

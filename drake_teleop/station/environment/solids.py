@@ -88,9 +88,7 @@ class Wall(Surface):
     """Fixed flat wall with position, normal, size and surface."""
 
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
-    normal: list[float] = quantity(
-        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
-    )
+    normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
     size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "edges of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:

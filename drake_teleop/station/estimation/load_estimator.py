@@ -38,15 +38,11 @@ class LoadEstimatorConfig:
         "update with every sample; only for free motion: a contact wrench would count as load",
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
-    method: str = choice(
-        "rls", (), "recursive least squares, or total: allows for noisy accelerations", METHODS
-    )
+    method: str = choice("rls", (), "least squares, or total: for noisy accelerations", METHODS)
     settled_bound: float = quantity(
         0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
     )
-    watch: bool = plain(
-        False, "freeze a settled load, or one that is given with its covariance; detect its change"
-    )
+    watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
     model_error: float = quantity(
         0.0, "1", 0.0, 0.5, "watch: error of the wrench by gains, cross-talk and delays, as a share"
     )

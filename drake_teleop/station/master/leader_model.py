@@ -39,15 +39,11 @@ class Leader:
         [], "folders for package:// addresses in it, from the scenario's folder", is_path=True
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
-    home: list[float] = quantity(
-        [], "rad, m", -1e4, 1e4, "start positions; by default 0, or the middle of the limits"
-    )
+    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start; default: 0 or middle of limits")
     base_rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
     )
-    weight_carried: float = quantity(
-        1.0, "1", 0.0, 1.0, "share of the arm's weight compensated by motors or springs"
-    )
+    weight_carried: float = quantity(1.0, "1", 0.0, 1.0, "compensated share of the arm's weight")
     friction: list[float] = quantity(
         [], "N m", 0.0, 1e6, "Coulomb friction of the joints, one for all or each; by default none"
     )
@@ -62,7 +58,7 @@ class Leader:
     leads: str = choice(
         "pose",
         ("pose", JOINT_MODE),
-        "pose: commands X_WS; joints: each joint commands that of a slave with equal kinematics",
+        "pose: X_WS; joints: each joint commands that of an equal slave",
     )
 
     def check(self, where: str) -> None:

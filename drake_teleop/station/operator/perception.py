@@ -48,12 +48,8 @@ class Perception:
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
-    depth_error: float = quantity(
-        2e-3, "m", 0.0, 0.1, "standard deviation of the perceived distance of a surface"
-    )
-    aim_error: float = quantity(
-        1e-3, "m", 0.0, 0.1, "standard deviation of the perceived lateral position of a slot"
-    )
+    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a surface's distance")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's lateral place")
 
     def compiled_parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per `dt` [s]."""

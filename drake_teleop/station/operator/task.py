@@ -33,9 +33,7 @@ class Reach(_Task):
 
 @dataclass
 class _ContactTask(_Task):
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance where the careful approach starts")
 
 
 @settings

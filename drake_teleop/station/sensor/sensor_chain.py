@@ -125,15 +125,9 @@ class WristSensorConfig:
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
-    force_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of force and torque, rounded to whole samples"
-    )
-    acceleration_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of accelerations, rounded to whole samples"
-    )
-    encoder_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of joint angles, rounded to whole samples"
-    )
+    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "of force and torque, whole samples")
+    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "of accelerations, whole samples")
+    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of joint angles, whole samples")
 
     def noise_std(self) -> Array:
         """Return the standard deviations (12,) of white noise in raw samples, in SI units."""

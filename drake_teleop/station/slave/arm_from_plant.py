@@ -14,7 +14,6 @@ from pydrake.multibody.tree import (
     BodyIndex,
     Frame,
     Joint,
-    JointActuator,
     ModelInstanceIndex,
     PrismaticJoint,
     RevoluteJoint,
@@ -66,10 +65,13 @@ def ArmModelFromPlant(
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
     joints = _moving_joints_to_sensor(inboard_joints, frame_S)
+    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
+    efforts = [min((motor.effort_limit() for motor in each), default=np.inf) for each in motors]
     n = len(joints)
     table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
-        table[row, ROTOR_COLUMN] = _reflected_rotor_inertia(plant, joint)
+        table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
@@ -107,7 +109,7 @@ def ArmModelFromPlant(
         upper=upper,
         velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
         acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=np.array([_effort_limit(plant, j) for j in joints]),
+        effort_limit=np.array(efforts),
         position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
         velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
     )
@@ -180,19 +182,6 @@ def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Arr
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
     return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
-
-
-def _actuators_of_joint(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
-    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    return [a for a in actuators if a.joint().index() == joint.index()]
-
-
-def _reflected_rotor_inertia(plant: MultibodyPlant, joint: Joint) -> float:
-    return sum(a.default_reflected_inertia() for a in _actuators_of_joint(plant, joint))
-
-
-def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
-    return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
 def values_per_joint(

@@ -34,9 +34,7 @@ class Scene(Environment):
     """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
-        "door.sdf",
-        ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
-        is_path=True,
+        "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots, in W")
     rotation: list[float] = quantity(
@@ -44,9 +42,7 @@ class Scene(Environment):
     )
     fixed: bool = plain(True, "weld free roots of the file there; false: they float")
     contact: str = choice(
-        "point",
-        ("point", "hydroelastic"),
-        "Drake's contact model; shapes that are not hydroelastic use point",
+        "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )
     tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
     slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")

@@ -41,9 +41,7 @@ class Slave:
         IK_METHODS,
     )
     model: str = plain(
-        "",
-        "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90",
-        is_path=True,
+        "", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90", is_path=True
     )
     package_paths: list[str] = plain(
         [], "folders of package:// addresses, from the scenario's folder", is_path=True
@@ -64,23 +62,14 @@ class Slave:
         {}, "N m, N", 1e-6, math.inf, "limits by joint instead of the model's; .inf: no limit"
     )
     friction: list[float] = quantity(
-        [],
-        "N m, N",
-        0.0,
-        1e6,
-        "dry friction of the joints, one for all or each, not compensated by joint control;"
-        " default: none",
+        [], "N m, N", 0.0, 1e6, "dry friction, one for all joints or each; control ignores it"
     )
     tool: Tool | None = field(
         default_factory=Tool,
         metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
     tip: list[float] = quantity(
-        [],
-        "m",
-        -10.0,
-        10.0,
-        "contact point p_STip; default: the tool's frame `tip`, or the end of its shapes along z_S",
+        [], "m", -10.0, 10.0, "p_STip; default: the frame `tip` or the end of the shapes along z_S"
     )
 
     @property

@@ -71,11 +71,7 @@ class Tool:
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
-        [0.0] * 6,
-        "kg m^2",
-        -10.0,
-        10.0,
-        "about the centre of mass: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel",
+        [0.0] * 6, "kg m^2", -10.0, 10.0, "about com: xx, xy, xz, yy, yz, zz; zeros: steel ball"
     )
     shapes: list[Ball | Block] = plain([], "collision shapes: !Ball, !Block")
 
