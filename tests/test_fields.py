@@ -1,4 +1,4 @@
-"""List of the fields of scenarios, the source of help texts, references and schemas."""
+"""Fields of scenarios: the source of help texts, references and schemas."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, re
 
 
 def everything(block: type) -> Iterator[tuple[type, FieldInfo]]:
-    """Yield the fields of a block and of all blocks in it."""
+    """Yield the fields of a block and of all its inner blocks."""
     for entry in fields_of(block):
         yield block, entry
         for inner in entry.blocks:
@@ -99,7 +99,7 @@ def test_each_number_of_a_list_or_mapping_is_in_its_range(place: str) -> None:
 
 
 def test_instance_gives_its_own_defaults() -> None:
-    """The same class is at two places with other defaults."""
+    """One class is used at two places with different defaults."""
     charged = named(PassivityConfig, "charged_tdpa").default
     plain = named(PassivityConfig, "tdpa").default
     assert named(plain, "drag").default == [0.0, 0.0] != named(charged, "drag").default

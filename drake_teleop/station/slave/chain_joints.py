@@ -42,9 +42,11 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
         child = joint.child_body()
         if child.index() in parents or child.index() == world:
             other = parents.get(child.index())
-            on = joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
-            what = f"link {child.name()} is the child of {on}"
-            remedy = "an arm is a tree: each link is the child of one joint, the world of none"
+            parents_text = joint.name()
+            if other is not None:
+                parents_text = f"two joints, {other.name()} and {joint.name()}"
+            what = f"link {child.name()} is the child of {parents_text}"
+            remedy = "an arm is a tree: make each link the child of one joint, the world of none"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         parents[child.index()] = joint
     for start in parents:
