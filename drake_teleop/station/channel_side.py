@@ -103,10 +103,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
         )
     stiffness, damping, mass = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
-        passivity,
-        servo_stiffness=stiffness,
-        servo_damping=damping,
-        slave_mass=mass,
+        passivity, servo_stiffness=stiffness, servo_damping=damping, slave_mass=mass
     )
 
 

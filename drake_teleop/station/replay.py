@@ -20,7 +20,6 @@ from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
-from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.replay_file import (
     Canvas,
@@ -300,8 +299,12 @@ class _ReplayDevice(NamedTuple):
 
 
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
-    if scenario.master.leader is not None:
-        return _add_leader_arm(plant, scenario.master.leader)
+    if (leader := scenario.master.leader) is not None:
+        order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
+        on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])
+        arm = leader.add_to_plant(plant, on_table)
+        hand, grip = arm.sensor_frame, np.zeros(3)
+        return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order], arm.mesh_folder)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
@@ -309,14 +312,6 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
     return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
-
-
-def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
-    order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
-    parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
-    return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.mesh_folder
-    )
 
 
 def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:

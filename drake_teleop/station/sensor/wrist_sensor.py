@@ -9,6 +9,7 @@ the compiled contact law (`ToolContactModel.beyond`) each sample is an event at 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -332,8 +333,8 @@ class WristSensor(LeafSystem):
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
         moving = contact.moving_bodies
         self.moving_bodies_sentence = ", ".join(moving) + " can move" * bool(moving)
-        self._twin_arguments = slave.config, slave.environment, slave.start
-        self._twin: ContactPlantCopy | None = None
+        copy = partial(ContactPlantCopy, slave.config, slave.environment, slave.start)
+        self._twin = cache(copy)  # made at its first use
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
@@ -458,8 +459,6 @@ class WristSensor(LeafSystem):
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
-        if self._twin is None:
-            self._twin = ContactPlantCopy(*self._twin_arguments)
         own = 2 * self._n + 2
         size = own + self._plant_size
         told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
@@ -471,7 +470,7 @@ class WristSensor(LeafSystem):
             if told[0, 1] <= k:
                 return
             asked = told[0, 2:]
-            told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
+            told[1 + k, :6] = self._twin().wrench_W(asked[:own], asked[own:])
 
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):

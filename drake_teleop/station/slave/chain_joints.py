@@ -232,14 +232,12 @@ def assume_rotor_inertias(
         (sliding if slides else turning).append(joint.name())
         motor[joint.index()].set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
-    return [
-        f"{what}, as the model has no inertia there, for {join_names(names)}"
-        for what, names in (
-            (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
-            (f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg", sliding),
-        )
-        if names
-    ]
+    notes = {
+        f"a rotor inertia of {inertia:.3g} kg m^2": turning,
+        f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg": sliding,
+    }
+    reason = "as the model has no inertia there"
+    return [f"{what}, {reason}, for {join_names(names)}" for what, names in notes.items() if names]
 
 
 def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: frozenset[str]) -> bool:

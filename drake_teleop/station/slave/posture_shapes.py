@@ -320,10 +320,6 @@ def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Arra
 def _unit_sphere_points() -> Array:
     latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_CIRCLE_POINTS // 2 + 1)
     longitude = 2 * np.pi * np.arange(_NUM_CIRCLE_POINTS) / _NUM_CIRCLE_POINTS
-    rings = [
-        np.column_stack(
-            [c * np.cos(longitude), c * np.sin(longitude), np.full(_NUM_CIRCLE_POINTS, s)]
-        )
-        for c, s in zip(np.cos(latitude), np.sin(latitude), strict=True)
-    ]
-    return np.vstack(rings)
+    latitudes, longitudes = np.meshgrid(latitude, longitude, indexing="ij")
+    x, y = np.cos(latitudes) * np.cos(longitudes), np.cos(latitudes) * np.sin(longitudes)
+    return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)

@@ -23,13 +23,9 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
     if len(carriers) != 1:
-        known = {
-            name
-            for tag in ("body", "site")
-            for top, *_ in tops
-            for name in _names_of_elements(top, tag)
-        }
-        what = "; ".join(describe_frame_fault(len(carriers), sensor, known - {""}))
+        names = [_names_of_elements(top, tag) for tag in ("body", "site") for top, *_ in tops]
+        known = set[str]().union(*names) - {""}
+        what = "; ".join(describe_frame_fault(len(carriers), sensor, known))
         for fault in (what, *reader.meshes.inaccessible):
             mjcf.report.add_fault(fault)
         mjcf.report.raise_faults(mjcf.path)
@@ -119,9 +115,8 @@ def report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
             mjcf.report.state_repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            mjcf.report.state_repair(
-                "no spring, which Drake does not read from MJCF, of", joint.name
-            )
+            what = "no spring, which Drake does not read from MJCF, of"
+            mjcf.report.state_repair(what, joint.name)
 
 
 def _names_of_elements(top: Element, tag: str) -> set[str]:
