@@ -193,21 +193,12 @@ def ScenarioNames() -> list[str]:
 def LoadScenario(name_or_path: str | Path) -> Scenario:
     """Load a shipped scenario by name, or a YAML file.
 
-    Missing fields keep their defaults. Paths of models are relative to the file's folder.
+    Missing fields keep their defaults. Paths in it are relative to the file's folder.
 
     Raises:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
-    data, where = ReadScenarioData(name_or_path)
-    scenario = ScenarioFromData(data, where)
-    folder = Path(where).parent
-    scenario.slave = scenario.slave.with_absolute_paths(folder)
-    scenario.master = scenario.master.with_absolute_paths(folder)
-    scenario.environment = [
-        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
-        for thing in scenario.environment
-    ]
-    return scenario
+    return ScenarioFromData(*ReadScenarioData(name_or_path))
 
 
 def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
@@ -247,7 +238,7 @@ def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | N
 def ScenarioFromData(data: Any, where: str) -> Scenario:
     """Convert parsed YAML data to a checked scenario, or raise DrakeTeleopError.
 
-    `where` is the file's name for messages.
+    `where` is the file's name for messages. Paths in the data are relative to its folder.
     """
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
@@ -259,6 +250,14 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     )
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
+    folder = Path(where).parent
+    scenario.slave = scenario.slave.with_absolute_paths(folder)
+    scenario.master = scenario.master.with_absolute_paths(folder)
+    scenario.channel = scenario.channel.with_absolute_paths(folder)
+    scenario.environment = [
+        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
+        for thing in scenario.environment
+    ]
     return scenario
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,17 @@ class Channel(NetworkConfig):
         "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
         "a minute of this network, at least 0.1 s",
     )
+
+    def with_absolute_paths(self, folder: Path) -> "Channel":
+        """Return a copy with the paths of traces resolved from the scenario's folder."""
+
+        def resolved_path(trace: str | None) -> str | None:
+            return None if trace is None else str((folder / trace).resolve())
+
+        back = self.backward
+        if back is not None:
+            back = dataclasses.replace(back, trace=resolved_path(back.trace))
+        return dataclasses.replace(self, trace=resolved_path(self.trace), backward=back)
 
     def networks_of_directions(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
         """Return the networks of both directions: forward (master to slave) and backward."""

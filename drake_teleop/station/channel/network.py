@@ -58,9 +58,10 @@ class NetworkConfig:
     )
     trace: str | None = plain(
         None,
-        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "
-        "the columns `time` [s], increasing, and `delay` [s], one-way, empty if the packet was "
-        "lost; between its rows the last one holds, after its end it starts again",
+        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file, "
+        "from the scenario's folder, with the columns `time` [s], increasing, and `delay` [s], "
+        "one-way, empty if the packet was lost; between its rows the last one holds, after its end "
+        "it starts again",
     )
     silence: str = choice(
         "hold",

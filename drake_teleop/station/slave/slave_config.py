@@ -13,6 +13,7 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_METHODS
+from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 
 
@@ -92,8 +93,10 @@ class Slave:
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def model_files(self) -> list[Path]:
+        """Return the existing files of arm and tool, with those that they include."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
-        return [path for path in paths if path.is_file()]
+        folders = self.package_folders
+        return [file for path in paths for file in list_model_files(path, folders)]
 
     def check(self, where: str) -> None:
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
