@@ -41,6 +41,21 @@ SCENARIOS = {
     ),
     "two leaves": ("{sheet_spring: {}, environment: [!SheetSpring {}]}", "yaml:environment"),
     "a slot too deep": ("slot: {depth: 0.5}", "slot.depth"),
+    "bandwidth beyond joint control": (
+        "joint_control: {velocity_bandwidth_hz: 700}",
+        "joint_control.velocity_bandwidth_hz",
+    ),
+    "negative seed of the sensor": ("wrist_sensor: {unit: -1}", "wrist_sensor.unit"),
+    "contact point in millimetres": ("slave: {tip: [0, 0, 112]}", "slave.tip"),
+    "centre of mass without a mass": ("slave: {tool: {com: [0, 0, 0.1]}}", "slave.tool.mass"),
+    "gripper of negative mass": (
+        "force_scaling: {gripper_phi: [-1, 0, 0, 0, 0, 0, 0, 0, 0, 0]}",
+        "force_scaling.gripper_phi",
+    ),
+    "scale too small for a method": (
+        "{kinematic_scaling: {rotation_scale: 1.0e-5}, passivity: {method: wave}}",
+        "passivity.method",
+    ),
     "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
 }
 

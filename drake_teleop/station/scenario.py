@@ -52,6 +52,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
 _MAX_CONTACT_STEP_S = 1.25e-4
+_MIN_SCALE_WITH_METHOD = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
 @settings
@@ -60,7 +61,9 @@ class Rates:
     """Sampling rates. Those of the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
-    hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
+    hand_hz: float = quantity(
+        2000.0, "Hz", 10.0, 1e5, "haptic device and channel; 1 kHz or more with a simulated device"
+    )
     joint_control_hz: float = quantity(
         2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz it samples inside steps"
     )
@@ -144,6 +147,19 @@ class Scenario:
     def without_environment(self) -> "Scenario":
         """Return a copy of the scenario without objects to touch."""
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
+
+    def with_absolute_paths(self, folder: Path) -> "Scenario":
+        """Return a copy with absolute paths; relative ones are relative to `folder`."""
+        return dataclasses.replace(
+            self,
+            slave=self.slave.with_absolute_paths(folder),
+            master=self.master.with_absolute_paths(folder),
+            channel=self.channel.with_absolute_paths(folder),
+            environment=[
+                thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
+                for thing in self.environment
+            ],
+        )
 
     @property
     def has_direct_channel(self) -> bool:
@@ -250,15 +266,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     )
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
-    folder = Path(where).parent
-    scenario.slave = scenario.slave.with_absolute_paths(folder)
-    scenario.master = scenario.master.with_absolute_paths(folder)
-    scenario.channel = scenario.channel.with_absolute_paths(folder)
-    scenario.environment = [
-        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
-        for thing in scenario.environment
-    ]
-    return scenario
+    return scenario.with_absolute_paths(Path(where).parent)
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:
@@ -331,9 +339,9 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         )
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
-    if scenario.passivity.method != "none" and min(scales) == 0.0:
+    if scenario.passivity.method != "none" and min(scales) < _MIN_SCALE_WITH_METHOD:
         raise DrakeTeleopError(
-            "passivity methods require kinematic scales above 0",
+            f"passivity methods require kinematic scales of {_MIN_SCALE_WITH_METHOD:g} or more",
             where=f"{where}:passivity.method",
-            remedy="set both scales of kinematic_scaling above 0, or method: none",
+            remedy="increase both scales of kinematic_scaling, or set method: none",
         )

@@ -148,6 +148,10 @@ def test_file_selects_device_and_overrides_figures():
     expected = dataclasses.replace(FIGURES["omega_3"], friction=0.1)
     assert scenario.master.figures == expected
     named = ScenarioFromData({"master": {"model": "falcon"}}, "mine.yaml")
+    other = replace(named, master__model="omega_7")  # its data sheet, not the falcon's
+    np.testing.assert_array_equal(
+        other.master.device(*HAND).parameters, Master(model="omega_7").device(*HAND).parameters
+    )
     np.testing.assert_array_equal(
         named.master.device(*HAND).parameters, Master(model="falcon").device(*HAND).parameters
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.config import choice, quantity, settings
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -145,7 +145,9 @@ class Master:
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
     friction: JointFriction = field(default_factory=JointFriction)
-    figures: DeviceFigures | None = None
+    figures: DeviceFigures | None = plain(
+        None, "values in place of those of the device's data sheet; null: the data sheet's"
+    )
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
@@ -262,4 +264,7 @@ _MAX_DEVICE_PITCH_RAD = 1.5  # rad
 
 
 def data_sheet_in_settings(block: Mapping[str, Any] | None) -> DeviceFigures | None:
+    """Return the data sheet that the `figures` of a `master` block change, or None without them."""
+    if (block or {}).get("figures") is None:
+        return None
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -16,6 +16,8 @@ from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_ME
 from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 
+_MAX_TIP_M = 2.0  # m, as of the tool's shapes
+
 
 @settings
 @dataclass
@@ -105,13 +107,14 @@ class Slave:
                 where=f"{where}.friction",
                 remedy="give finite numbers of 0 or more",
             )
-        for name, length in (("home", len(self.home)), ("tip", 3)):
-            values = getattr(self, name)
-            if values and (len(values) != length or not all(np.isfinite(values))):
-                raise DrakeTeleopError(
-                    "must be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
-                    where=f"{where}.{name}",
-                )
+        if not np.isfinite(self.home).all():
+            raise DrakeTeleopError("must be a list of finite numbers", where=f"{where}.home")
+        if self.tip and not (len(self.tip) == 3 and all(abs(x) <= _MAX_TIP_M for x in self.tip)):
+            raise DrakeTeleopError(
+                f"{self.tip} is no position of three numbers within {_MAX_TIP_M:g} m",
+                where=f"{where}.tip",
+                remedy="give x, y and z in S [m]",
+            )
         for joint, position in self.hold.items():
             if not np.isfinite(position):
                 raise DrakeTeleopError(

@@ -96,9 +96,9 @@ class Tool:
                 where=f"{where}.mass",
                 remedy="leave one of them out",
             )
-        if self.mass == 0.0 and (self.shapes or any(self.inertia)):
+        if self.mass == 0.0 and (self.shapes or any(self.inertia) or self.com != Tool().com):
             raise DrakeTeleopError(
-                "shapes and inertia require a mass",
+                "shapes, inertia and com require a mass",
                 where=f"{where}.mass",
                 remedy="give the mass, or remove them",
             )
