@@ -118,6 +118,24 @@ def test_a_malformed_scenario(name, tmp_path, capsys):
         assert "scenario.yaml" in line
 
 
+def test_run_keeps_its_scenario_and_a_recorded_drive(tmp_path, capsys):
+    own, drive = tmp_path / "scenario.yaml", tmp_path / "drive"
+    drive.mkdir()
+    for path in (own, drive / "scenario.yaml", drive / "inputs.csv"):
+        path.write_text("{}  # mine")
+    line = error_line(["run", own, "--out", tmp_path], capsys)
+    assert "contains the input scenario.yaml, which the results would replace; give an" in line
+    line = error_line(["run", own, "--out", drive], capsys)
+    assert "drive: contains a recorded drive, which the results would replace" in line
+    assert {path.read_text() for path in tmp_path.rglob("*.*")} == {"{}  # mine"}
+
+
+def test_empty_output_folder_is_not_the_working_directory(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "'--out': the path is empty" in error_line(["run", "press", "--out", ""], capsys)
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_unknown_scenario_lists_the_known_ones(tmp_path, capsys):
     line = error_line(["run", "free_moton", "--out", tmp_path], capsys)
     assert "free_motion_force" in line

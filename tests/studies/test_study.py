@@ -582,6 +582,12 @@ def test_measures_of_a_known_motion():
     )
 
 
+def test_run_without_a_hand_has_no_measures():
+    result = SimulationResult(np.arange(3.0), {}, [])
+    with pytest.raises(DrakeTeleopError, match=r"operator\.intent: the run identifies the load"):
+        evaluate_measures(result, Scenario(), default_measures(), 1.0)
+
+
 def test_preset_as_factor_sets_its_values():
     work = studies.StationRunFunction({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
