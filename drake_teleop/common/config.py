@@ -379,7 +379,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         if "choices" in metadata
         else (),
         blocks=blocks,
-        meaning=metadata.get("doc") or _first_docstring_line(blocks[0]),
+        meaning=metadata.get("doc") or (_first_docstring_line(blocks[0]) if blocks else ""),
         is_mapping=is_mapping,
     )
 

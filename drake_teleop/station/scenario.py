@@ -47,7 +47,9 @@ from drake_teleop.station.slave.slave_config import Slave
 
 _T = TypeVar("_T")
 ENVIRONMENTS: Registry[type[Environment]] = Registry(
-    "environment", {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)}
+    "environment",
+    {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)},
+    Environment,
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.

@@ -124,6 +124,7 @@ FIGURES = Registry(
         name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELD_NAMES, copy.deepcopy(row), strict=True)))
         for name, row in _DATA_SHEETS.items()
     },
+    DeviceFigures,
 )
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3

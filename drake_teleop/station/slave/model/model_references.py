@@ -59,6 +59,13 @@ class ModelFiles:
         self._total = 0, 0
         _check_num_files_and_size(1, model.stat().st_size, model)
         self.packages: dict[str, Path] = {}
+        for folder in package_paths:
+            if not folder.is_dir():
+                raise DrakeTeleopError(
+                    f"there is no folder {folder} for its packages",
+                    where=str(model),
+                    remedy="correct slave.package_paths or --package-path",
+                )
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
             if folder.is_dir():
