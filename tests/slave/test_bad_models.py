@@ -328,7 +328,7 @@ def test_rounded_inertia_is_preserved(tmp_path):
         ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
         ({"home": [3.0, *HOME[1:]]}, "home: joint j1 at 3 is outside its limits, -2.5 to 2.5"),
         ({"home": HOME[:5]}, "slave.home: 5 joint positions are given for 6 joints"),
-        ({"tip": [0.0, 0.1]}, "slave.tip: must be a list"),
+        ({"tip": [0.0, 0.1]}, r"slave.tip: .* is no position of three numbers"),
         ({"tool": Tool(mass=90.0)}, "slave.tool: the arm cannot hold its 90 kg .* j2 needs"),
         ({"tool": Tool(model="none.sdf")}, "none.sdf: there is no such file"),
         ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: no body with a mass is attached"),
