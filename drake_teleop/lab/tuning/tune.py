@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_teleop.common.files import (
+    check_inputs_are_kept,
     make_folder,
     output_folder,
     write_json,
@@ -65,6 +66,8 @@ def tune(
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), make_stated_set(hands, walls, task)
+    if not isinstance(scenario, Scenario):
+        check_inputs_are_kept(out / "tuned.yaml", scenario)
     base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
