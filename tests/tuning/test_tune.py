@@ -28,13 +28,17 @@ from drake_teleop.station.scenario import LoadScenario, replace
 GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
 
 
-def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
-    stated = make_stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
+def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
+    stated = make_stated_set(["firm", "light"], [20.0, 0.5, 3.0], "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
         ("light", 20000.0), ("firm", 20000.0), ("light", 500.0), ("firm", 500.0),
     ]  # fmt: skip
+    stiffest, softer = stated.tested_walls
+    assert stiffest == [20000.0]
+    assert softer == pytest.approx([20000.0 * 40 ** (-k / 3) for k in (1, 2, 3)])
+    assert make_stated_set(["light"], [3.0], "press").tested_walls == [[3000.0], [3000.0]]
 
 
 @pytest.mark.parametrize(
@@ -87,13 +91,18 @@ def test_station_holds_only_if_it_rests_quietly_and_renders_the_force(change):
 
 
 class FakeStation:
-    """Answers of a station that is stable with `ledger` below a product of gamma and wall."""
+    """Answers of a station that is stable with `ledger` below a product of gamma and wall.
 
-    def __init__(self, limit: float, one_axis_limit: float) -> None:
-        self.limit, self.one_axis_limit, self.names = limit, one_axis_limit, []
+    `noise` [N] is the force at rest for gamma = 1; the medium grip fails above `medium_limit`.
+    """
+
+    def __init__(
+        self, limit: float, one_axis_limit: float, noise=1e-3, medium_limit: float = np.inf
+    ) -> None:
+        self.limit, self.one_axis_limit, self.runs = limit, one_axis_limit, {}
+        self.noise, self.medium_limit = noise, medium_limit
 
     def __call__(self, name, study, work):
-        self.names.append(name)
         rows = [dict(point) for point in study.points()]
         for row in rows:
             if name == "search":
@@ -101,7 +110,11 @@ class FakeStation:
                 row |= {"gamma_limit": limit, "linear_limit": 0.0, "share": 0.95}
             else:
                 row |= GOOD | {"threshold_N": 1.0 / row["gamma"]}
-                row["rests"] = float(row["gamma"] * row["wall"] <= self.limit)
+                row["rest_force_N"] = self.noise * row["gamma"]
+                stable = row["gamma"] * row["wall"] <= self.limit
+                stable &= row["hand"] != "medium" or row["gamma"] <= self.medium_limit
+                row["rests"] = float(stable)
+        self.runs[name] = rows
         return rows
 
 
@@ -117,8 +130,11 @@ def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
     found = search_settings(trial(), FakeStation(limit=np.inf, one_axis_limit=2.2))
     assert (found.settings.method, found.settings.sigma_inertia) == ("ledger", 0.0)
     assert found.settings.gamma == pytest.approx(2.2 / 1.1)
-    assert {row["wall"] for row in found.limit_runs} == {20000.0, 24000.0, 40000.0}
-    assert all(row["gamma"] == found.settings.gamma for row in found.limit_runs)
+    gamma = found.settings.gamma
+    beyond = [
+        (row["wall"], row["gamma"] / gamma) for row in found.beyond_runs if row["hand"] == "firm"
+    ]
+    assert beyond == [(20000.0, pytest.approx(1.32)), (24000.0, 1.0), (40000.0, 1.0)]
 
 
 def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin():
@@ -126,11 +142,25 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     station = FakeStation(limit=limit, one_axis_limit=2.2)
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
-    assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(
-        trial().stated_set.corners
+    assert {row["gamma"] for row in found.inside_runs} == {1.1 * found.settings.gamma}
+    assert len({(row["hand"], row["wall"]) for row in found.inside_runs}) == 3 * 4
+    assert not all(meets_requirements(row) for row in found.beyond_runs)
+
+
+def test_search_tests_grips_between_the_softest_and_the_firmest():
+    found = search_settings(
+        trial(), FakeStation(limit=np.inf, one_axis_limit=2.2, medium_limit=1.0)
     )
-    assert not all(meets_requirements(row) for row in found.limit_runs)
+    assert 1.1 * found.settings.gamma <= 1.0 < 1.1 * 1.15 * found.settings.gamma
+
+
+def test_search_takes_the_gamma_of_accepted_noise_in_few_tries():
+    station = FakeStation(limit=np.inf, one_axis_limit=2.2, noise=0.03)
+    found = search_settings(trial(), station)
+    accepted = MAX_REST_FORCE_N / (1.1 * 0.03)
+    assert accepted / 1.1 <= found.settings.gamma <= accepted
+    assert sum(name.startswith("station") for name in station.runs) == 3
+    assert not all(meets_requirements(row) for row in found.beyond_runs)
 
 
 def test_search_refuses_a_set_that_no_settings_hold():

@@ -159,7 +159,7 @@ class StationTrial:
 class GammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
-    `gamma_upper_bounds`: low-pass [Hz] -> upper bound of gamma.
+    `gamma_upper_bounds`: low-pass [Hz] -> largest tried gamma.
     """
 
     base_scenario: Scenario
@@ -171,22 +171,19 @@ class GammaSearch:
         axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_gamma_limit(axis, settings)
-        cap = (
-            self.gamma_upper_bounds[settings.low_pass_hz]
-            * self.stated_set.requirements.loop_gain_margin
-        )
+        cap = self.gamma_upper_bounds[settings.low_pass_hz]
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
 
         def stability_sign(log_gamma: float) -> float:
-            gamma = float(np.exp(log_gamma))
-            found = [
-                self.share_in_one_axis(axis, settings, gamma, *c, seed)
-                for c in self.stated_set.corners
-            ]
-            shares[gamma] = min(found)
-            return 1.0 if shares[gamma] >= MIN_RENDERED_FORCE_SHARE else -1.0
+            gamma, share = float(np.exp(log_gamma)), np.inf
+            for corner in self.stated_set.corners:
+                share = min(share, self.share_in_one_axis(axis, settings, gamma, *corner, seed))
+                if share < MIN_RENDERED_FORCE_SHARE:
+                    return -1.0
+            shares[gamma] = share
+            return 1.0
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
@@ -196,8 +193,7 @@ class GammaSearch:
                 if stability_sign(low) > 0
                 else -np.inf
             )
-        accepted = [gamma for gamma, share in shares.items() if share >= MIN_RENDERED_FORCE_SHARE]
-        gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
+        gamma = max((g for g in shares if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
