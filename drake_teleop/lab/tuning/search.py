@@ -20,18 +20,20 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
     GIVEN_SETTINGS_NAME,
+    MAX_RENDERED_FORCE_ERROR,
     MAX_REST_FORCE_N,
-    MIN_RENDERED_FORCE_SHARE,
+    MAX_TUNED_FORCE_ERROR,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
     StationTrial,
     TunedSettings,
+    renders_force,
     settings_from_values,
 )
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_FORCE_SHARE`."""
+"""Candidates; others are dominated by them or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
 STIFFEST_WALL_FACTORS = (1.2, 2.0)
@@ -135,40 +137,45 @@ def _find_gamma_limit_in_station(
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
     stated = trial.stated_set
     margin = stated.requirements.loop_gain_margin
-    stable, failed, inside = 0.0, np.inf, []
-    gamma, tries = settings.gamma, 0
-    while gamma >= settings.gamma / _MAX_GAMMA_REDUCTION:
+
+    def run_at_walls(gamma: float, part: int) -> list[Row]:
         tried = dataclasses.replace(settings, gamma=margin * gamma)
-        rows: list[Row] = []
-        # The stiffest wall first: it fails more often. The others have another seed.
-        for seed, walls in enumerate(stated.tested_walls):
-            name = f"station_{settings.method}_{tries}_{seed}"
-            study = _study_of_settings(tried, list(stated.hands), walls, seed)
-            rows += execute(name, study, trial)
-            if not all(map(meets_requirements, rows)):
-                failed, smaller = gamma, gamma / 2
-                if all(meets_requirements(row | {"rest_force_N": 0.0}) for row in rows):
-                    # Noise grows with gamma.
-                    noise = max(row["rest_force_N"] for row in rows)
-                    quiet = gamma * MAX_REST_FORCE_N / noise
-                    smaller, failed = (
-                        max(smaller, quiet / _NOISE_STEP),
-                        min(failed, quiet * _NOISE_STEP),
-                    )
-                break
+        study = _study_of_settings(tried, list(stated.hands), stated.tested_walls[part], seed=part)
+        return execute(f"station_{settings.method}_{gamma:.6g}_{part}", study, trial)
+
+    def holds(rows: list[Row]) -> bool:
+        return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
+
+    gamma, stable, failed = settings.gamma, 0.0, np.inf
+    smallest = gamma / _MAX_GAMMA_REDUCTION
+    while gamma >= smallest:
+        rows = run_at_walls(gamma, 0)  # the stiffest wall fails more often
+        if holds(rows):
+            stable = gamma
         else:
-            stable, inside = gamma, rows
-        tries += 1
+            failed, smaller = gamma, gamma / 2
+            if holds([row | {"rest_force_N": 0.0} for row in rows]):
+                # Noise grows with gamma.
+                quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
+                smaller = max(smaller, quiet / _NOISE_STEP)
+                failed = min(failed, quiet * _NOISE_STEP)
         if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
-    return stable, inside
+    while stable >= smallest:
+        rows = run_at_walls(stable, 0) + run_at_walls(stable, 1)
+        if holds(rows):
+            return stable, rows
+        stable /= _MAX_UNSTABLE_OVER_STABLE_GAMMA
+    return 0.0, []
 
 
-def meets_requirements(row: Mapping[str, Any]) -> bool:
+def meets_requirements(
+    row: Mapping[str, Any], max_force_error: float = MAX_RENDERED_FORCE_ERROR
+) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_FORCE_SHARE)
+    return bool(row["rests"] and quiet and renders_force(row["share"], max_force_error))
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:

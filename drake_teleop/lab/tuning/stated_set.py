@@ -65,10 +65,9 @@ class StatedSet:
 
     @property
     def tested_walls(self) -> list[list[float]]:
-        """Stiffest wall; then softer ones, evenly spaced in their logarithm."""
+        """Stiffest wall; then, for another seed, all walls, evenly spaced in their logarithm."""
         low, high = self.walls
-        softer = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 2)[1:]
-        return [[high], softer.tolist()]
+        return [[high], np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()]
 
     @property
     def requirements(self) -> TaskRequirements:

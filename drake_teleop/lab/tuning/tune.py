@@ -115,9 +115,11 @@ def _make_tuning_summary(
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
     failed = [row for row in found.beyond_runs if not meets_requirements(row)]
+    shares = [row["share"] for row in [*found.inside_runs, *found.edge_runs]]
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
-        "share": min(row["share"] for row in [*found.inside_runs, *found.edge_runs]),
+        "share": min(shares),
+        "largest_share": max(shares),
         "threshold_N": max(row["threshold_N"] for row in found.edge_runs),
         "given_threshold_N": worst_given
         if all(map(meets_requirements, found.given_runs))
@@ -166,8 +168,8 @@ def _tuning_result_sentences(
         f"{chosen.low_pass_hz:g} Hz.",
         f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
         f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
-        f"It renders {figures['share']:.2f} of the scaled contact force at least; above 5 Hz the "
-        f"force at rest has {figures['rest_force_N']:.3f} N rms.",
+        f"It renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
+        f"contact force; above 5 Hz the force at rest has {figures['rest_force_N']:.3f} N rms.",
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
     ]
