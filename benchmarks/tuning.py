@@ -8,7 +8,8 @@ inside    share of random grips, walls and seeds in the stated set that do not r
           not render 0.9 to 1.1 of the contact force: `--draws` in one axis, `--station-draws` in
           the whole station
 outside   the same at the stiffest wall with gamma 20 % beyond the margin, all grips, other seeds
-beyond    if `tune` states no failure: the same up to the stiffest wall that it names
+beyond    the same where `tune` states a failure; if it states none, up to the stiffest wall that it
+          names
 advice    the stiffest wall in the whole station with `ledger`, gamma 1, sigma 0, as choose.md says
           for unknown walls and operators: detection threshold and rendered share
 """
@@ -117,10 +118,14 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
         "inside_fails": failing_share(drawn_walls(*stated.walls, station_draws)),
         "outside_fails_in_axis": failing_share_in_axis(at_stiffest, beyond * settings.gamma),
         "outside_fails": failing_share(at_stiffest, beyond * settings.gamma),
-        "beyond_fails": None
-        if row["fails_at"]
-        else failing_share(drawn_walls(stiffest, row["beyond_N_per_m"], station_draws)),
     }
+    if row["fails_at"]:
+        point = {"hand": row["fails_at"]["hand"], "wall": row["fails_at"]["wall_N_per_m"]}
+        factor = row["fails_at"]["gamma_factor"]
+        row["beyond_fails"] = failing_share([point] * station_draws, factor * settings.gamma)
+    else:
+        walls = drawn_walls(stiffest, row["beyond_N_per_m"], station_draws)
+        row["beyond_fails"] = failing_share(walls)
     advice = {"method": "ledger", "gamma": 1.0, "sigma_inertia": 0.0}
     advice["low_pass_hz"] = base.wrist_sensor.bandwidth_hz
     advised = [trial(values | advice | at_stiffest[k], 0) for k in (0, -1)]
@@ -144,10 +149,10 @@ def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "all_inside": sum(row["inside_fails"] == 0.0 for row in tuned),
         "outside_fails": sum(row["outside_fails"] > 0.0 for row in tuned),
         "outside_fails_in_axis": sum(row["outside_fails_in_axis"] > 0.0 for row in tuned),
-        "outside_as_stated": sum(
-            (row["outside_fails"] > 0.0)
+        "beyond_as_stated": sum(
+            row["beyond_fails"] > 0.0
             if row["fails_at"]
-            else not row["beyond_fails"] and row["outside_fails"] == 0.0
+            else row["beyond_fails"] == row["outside_fails"] == 0.0
             for row in tuned
         ),
         "better_than_advice": sum(row["better_than_advice"] for row in tuned),

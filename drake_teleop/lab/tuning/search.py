@@ -125,9 +125,9 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     _, chosen, inside = found[0]
     edge = execute("edge", _study_of_settings(chosen, ends, [stiffest]), trial)
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
-    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest]), trial)
+    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
     walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
-    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls), trial)
+    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
     return SearchResult(chosen, search, given, inside, edge, beyond)
 
 
@@ -216,7 +216,12 @@ def _rms_load_force_in_swing(trial: StationTrial) -> float:
 
 
 def _study_of_settings(
-    settings: TunedSettings, hands: list[str], walls: list[float], seed: int = 0
+    settings: TunedSettings,
+    hands: list[str],
+    walls: list[float],
+    *,
+    seed: int = 0,
+    repeats: int = 1,
 ) -> Study:
     factors = [
         Factor(field="method", words=[settings.method]),
@@ -226,4 +231,4 @@ def _study_of_settings(
         Factor(field="hand", words=hands),
         Factor(field="wall", values=walls),
     ]
-    return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed)
+    return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed, repeats=repeats)
