@@ -51,7 +51,7 @@ HANDS, WALLS, TASK = ("light", "medium", "firm"), (0.5, 20.0), "press"
 
 
 def drawn(rng: np.random.Generator) -> tuple[str, Scenario, str]:
-    """Name, scenario and network of a station."""
+    """Return name, scenario and network of a station."""
     arm, device, network = (str(rng.choice(names)) for names in (ARMS, DEVICES, NETWORKS))
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.2))))
     scenario = replace(
@@ -68,7 +68,7 @@ def drawn(rng: np.random.Generator) -> tuple[str, Scenario, str]:
 
 
 def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, Any]:
-    """Row of one station."""
+    """Return the row of one station."""
     rng = np.random.default_rng([seed, 55])
     name, scenario, network = drawn(rng)
     row: dict[str, Any] = {"seed": seed, "station": name}
@@ -141,6 +141,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
 
 
 def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the numbers of stations, and the rows."""
     tuned = [row for row in rows if "error" not in row]
     return {
         "stations": len(rows),
@@ -166,10 +167,12 @@ def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--stations", type=int, default=20)
-    parser.add_argument("--draws", type=int, default=500, help="in one axis")
-    parser.add_argument("--station-draws", type=int, default=4, help="in the whole station")
+    parser.add_argument("--draws", type=int, default=500, help="draws in one axis (default: 500)")
+    parser.add_argument(
+        "--station-draws", type=int, default=4, help="draws in the whole station (default: 4)"
+    )
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     asked = parser.parse_args(arguments)
     rows = []
     for seed in range(1, 1 + asked.stations):

@@ -275,7 +275,7 @@ class State:
             [
                 y[:, : OMEGA_PRODUCTS.stop],
                 y[:, ROTATION_SIGNALS] if self.data.gravity_W is not None else y[:, :0],
-                y[:, R_P_PRODUCTS] @ _cable_stiffness_signals().T
+                y[:, R_P_PRODUCTS] @ _cable_stiffness_selector().T
                 if self.data.has_positions
                 else y[:, :0],
                 part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
@@ -316,7 +316,8 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _cable_stiffness_signals() -> Array:
+def _cable_stiffness_selector() -> Array:
+    """Return the matrix (18, 27) from `R_P_PRODUCTS` to the signals of a symmetric stiffness."""
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):
