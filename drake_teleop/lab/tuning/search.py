@@ -1,7 +1,7 @@
 """Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
 
 Limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
-its softest and stiffest wall and between them.
+its softest and stiffest wall and between them, with several seeds.
 """
 
 from __future__ import annotations
@@ -138,21 +138,22 @@ def _find_gamma_limit_in_station(
     stated = trial.stated_set
     margin = stated.requirements.loop_gain_margin
 
-    def run_at_walls(gamma: float, part: int) -> list[Row]:
-        tried = dataclasses.replace(settings, gamma=margin * gamma)
-        study = _study_of_settings(tried, list(stated.hands), stated.tested_walls[part], seed=part)
-        return execute(f"station_{settings.method}_{gamma:.6g}_{part}", study, trial)
-
     def holds(rows: list[Row]) -> bool:
         return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
 
     gamma, stable, failed = settings.gamma, 0.0, np.inf
     smallest = gamma / _MAX_GAMMA_REDUCTION
+    inside: list[Row] = []
     while gamma >= smallest:
-        rows = run_at_walls(gamma, 0)  # the stiffest wall fails more often
-        if holds(rows):
-            stable = gamma
+        tried, rows = dataclasses.replace(settings, gamma=margin * gamma), []
+        for seed, (hands, walls) in enumerate(stated.tested_parts):
+            name = f"station_{settings.method}_{gamma:.6g}_{seed}"
+            rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
+            if not holds(rows):
+                break
         else:
+            stable, inside = gamma, rows
+        if stable < gamma:
             failed, smaller = gamma, gamma / 2
             if holds([row | {"rest_force_N": 0.0} for row in rows]):
                 # Noise grows with gamma.
@@ -162,12 +163,7 @@ def _find_gamma_limit_in_station(
         if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
-    while stable >= smallest:
-        rows = run_at_walls(stable, 0) + run_at_walls(stable, 1)
-        if holds(rows):
-            return stable, rows
-        stable /= _MAX_UNSTABLE_OVER_STABLE_GAMMA
-    return 0.0, []
+    return stable, inside
 
 
 def meets_requirements(

@@ -64,10 +64,12 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def tested_walls(self) -> list[list[float]]:
-        """Stiffest wall; then, for another seed, all walls, evenly spaced in their logarithm."""
+    def tested_parts(self) -> list[tuple[list[str], list[float]]]:
+        """Grips and walls of each part of the tests; the softest grip twice: it fails first."""
         low, high = self.walls
-        return [[high], np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()]
+        walls = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()
+        softest, others = [self.hands[0]], list(self.hands[1:])
+        return [(hands, walls) for hands in (softest, softest, others) if hands]
 
     @property
     def requirements(self) -> TaskRequirements:
