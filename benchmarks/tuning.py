@@ -11,7 +11,7 @@ outside   the same at the stiffest wall with gamma 20 % beyond the margin, all g
 beyond    the same where `tune` states a failure; if it states none, up to the stiffest wall that it
           names
 advice    the stiffest wall in the whole station with `ledger`, gamma 1, sigma 0, as choose.md says
-          for unknown walls and operators: detection threshold and rendered share
+          for unknown walls and operators: detection threshold and error of the rendered force
 """
 
 from __future__ import annotations
@@ -132,9 +132,13 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     row |= {
         "advice_holds": all(map(meets_requirements, advised)),
         "advice_threshold_N": max(run["threshold_N"] for run in advised),
-        "advice_share": min(run["share"] for run in advised),
+        "advice_force_error": max(abs(run["share"] - 1.0) for run in advised),
     }
-    better = row["threshold_N"] < row["advice_threshold_N"], row["share"] > row["advice_share"]
+    force_error = max(1.0 - row["share"], row["largest_share"] - 1.0)
+    better = (
+        row["threshold_N"] < row["advice_threshold_N"],
+        force_error < row["advice_force_error"],
+    )
     row["better_than_advice"] = not row["advice_holds"] or better[0]
     row["worse_than_advice"] = row["advice_holds"] and not any(better)
     return row

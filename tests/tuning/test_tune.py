@@ -37,9 +37,15 @@ def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_e
     ]  # fmt: skip
     walls = pytest.approx([20000.0 * 40 ** (-k / 3) for k in range(4)])
     assert stated.tested_parts == [
-        (["light"], walls), (["light"], walls), (["medium", "firm"], walls)
-    ]  # fmt: skip
-    assert make_stated_set(["light"], [3.0], "press").tested_parts == 2 * [(["light"], [3000.0])]
+        (1.1, ["light"], walls),
+        (1.1, ["light"], walls),
+        (1.1, ["medium", "firm"], walls),
+        (1.0, ["light", "firm"], [20000.0]),
+    ]
+    assert make_stated_set(["light"], [3.0], "press").tested_parts == [
+        *(2 * [(1.1, ["light"], [3000.0])]),
+        (1.0, ["light"], [3000.0]),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -159,7 +165,8 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     station = FakeStation(limit=limit, one_axis_limit=2.2)
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
-    assert {row["gamma"] for row in found.inside_runs} == {1.1 * found.settings.gamma}
+    gamma = found.settings.gamma
+    assert {row["gamma"] for row in found.inside_runs} == {1.1 * gamma, gamma}
     assert len({(row["hand"], row["wall"]) for row in found.inside_runs}) == 3 * 4
     assert not all(meets_requirements(row) for row in found.beyond_runs)
 
@@ -176,7 +183,13 @@ def test_search_takes_the_gamma_of_accepted_noise_in_few_tries():
     found = search_settings(trial(), station)
     accepted = MAX_REST_FORCE_N / (1.1 * 0.03)
     assert accepted / 1.1 <= found.settings.gamma <= accepted
-    assert [name[-2:] for name in station.runs if "station" in name] == ["_0", "_0", "_1", "_2"]
+    assert [name[-2:] for name in station.runs if "station" in name] == [
+        "_0",
+        "_0",
+        "_1",
+        "_2",
+        "_3",
+    ]
     assert not all(meets_requirements(row) for row in found.beyond_runs)
 
 

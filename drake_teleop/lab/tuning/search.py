@@ -56,8 +56,7 @@ class SearchResult:
     Attributes:
         searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
         given_runs: runs of the user's settings at the stiffest wall.
-        inside_runs: runs of the chosen settings in the stated set, gamma times margin.
-        edge_runs: runs of the chosen settings at the stiffest wall.
+        inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
         beyond_runs: runs with a larger gamma, then at stiffer walls.
     """
 
@@ -65,7 +64,6 @@ class SearchResult:
     searched_settings: list[Row]
     given_runs: list[Row]
     inside_runs: list[Row]
-    edge_runs: list[Row]
     beyond_runs: list[Row]
 
 
@@ -123,20 +121,17 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    edge = execute("edge", _study_of_settings(chosen, ends, [stiffest]), trial)
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
     beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
     walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
     beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
-    return SearchResult(chosen, search, given, inside, edge, beyond)
+    return SearchResult(chosen, search, given, inside, beyond)
 
 
 def _find_gamma_limit_in_station(
     settings: TunedSettings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
-    stated = trial.stated_set
-    margin = stated.requirements.loop_gain_margin
 
     def holds(rows: list[Row]) -> bool:
         return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
@@ -145,8 +140,9 @@ def _find_gamma_limit_in_station(
     smallest = gamma / _MAX_GAMMA_REDUCTION
     inside: list[Row] = []
     while gamma >= smallest:
-        tried, rows = dataclasses.replace(settings, gamma=margin * gamma), []
-        for seed, (hands, walls) in enumerate(stated.tested_parts):
+        rows: list[Row] = []
+        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
+            tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
             if not holds(rows):

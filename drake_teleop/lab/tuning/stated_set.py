@@ -64,12 +64,16 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def tested_parts(self) -> list[tuple[list[str], list[float]]]:
-        """Grips and walls of each part of the tests; the softest grip twice: it fails first."""
+    def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
+        """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
+
+        The softest grip fails first: it is tested twice. The last part has no margin.
+        """
         low, high = self.walls
+        margin, hands = self.requirements.loop_gain_margin, list(self.hands)
         walls = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()
-        softest, others = [self.hands[0]], list(self.hands[1:])
-        return [(hands, walls) for hands in (softest, softest, others) if hands]
+        parts = [(margin, part, walls) for part in (hands[:1], hands[:1], hands[1:]) if part]
+        return [*parts, (1.0, [*dict.fromkeys((hands[0], hands[-1]))], [high])]
 
     @property
     def requirements(self) -> TaskRequirements:

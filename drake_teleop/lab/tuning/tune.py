@@ -115,16 +115,17 @@ def _make_tuning_summary(
 ) -> dict[str, Any]:
     scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
     failed = [row for row in found.beyond_runs if not meets_requirements(row)]
-    shares = [row["share"] for row in [*found.inside_runs, *found.edge_runs]]
+    shares = [row["share"] for row in found.inside_runs]
+    edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
         "share": min(shares),
         "largest_share": max(shares),
-        "threshold_N": max(row["threshold_N"] for row in found.edge_runs),
+        "threshold_N": max(row["threshold_N"] for row in edge),
         "given_threshold_N": worst_given
         if all(map(meets_requirements, found.given_runs))
         else None,
-        "rest_force_N": max(row["rest_force_N"] for row in found.edge_runs),
+        "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
         "fails_at": {
             "hand": failed[0]["hand"],
@@ -149,7 +150,7 @@ def _make_tuning_summary(
         "figures": figures,
         "sentences": _tuning_result_sentences(found.settings, figures, about, scale),
         "search": found.searched_settings,
-        "trials": [*found.given_runs, *found.inside_runs, *found.edge_runs, *found.beyond_runs],
+        "trials": [*found.given_runs, *found.inside_runs, *found.beyond_runs],
     }
 
 
