@@ -36,6 +36,8 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
+        if np.asarray(value).dtype.kind in "mM":
+            raise ValueError("dates or time spans")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         what = f"holds no numbers ({error})"
@@ -68,6 +70,8 @@ def _broadcast_to_table(table: Array, shape: tuple[int, ...]) -> Array:
 def to_float(name: str, value: Any) -> float:
     """Return `value` as a float, possibly NaN; raise DrakeTeleopError if not numeric."""
     try:
+        if isinstance(value, (str, bytes)):
+            raise TypeError
         return float(
             float_array(name, value) if isinstance(value, (np.generic, np.ndarray)) else value
         )

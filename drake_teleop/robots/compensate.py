@@ -15,12 +15,13 @@ import numpy as np
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, handle_sigint
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.streams import CompensatedWrench, Reading, Sink, Source
+from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
 from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
@@ -50,7 +51,7 @@ class TareRequestPort:
 
 
 def compensate_stream(
-    source: Source[Reading],
+    source: Source,
     compensator: Compensator,
     sink: Sink,
     *,
@@ -158,6 +159,8 @@ def run_compensate_command(
     wrenches = open_sink(sink)
     control_port = None if control is None else TareRequestPort(control)
     changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
+    for note in notes_on_undetermined_load(found):
+        report(f"warning: {note}")
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     report(f"outputs are {1e3 * late:.1f} ms late")
     report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")

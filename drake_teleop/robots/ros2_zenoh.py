@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.errors import require_library
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2_messages import (
@@ -19,12 +19,12 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged_part_of_topic,
+    damaged_reading_of_topic,
     domain_of_address,
     topic_of_address,
     topics_frames_and_streams,
 )
-from drake_teleop.robots.streams import CompensatedWrench, Part
+from drake_teleop.robots.streams import CompensatedWrench, Reading, Source
 
 DEFAULT_ROUTER_PORT = 7447
 _NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
@@ -46,7 +46,7 @@ def message_types() -> Any:
 
 
 def open_session(address: Address) -> Any:
-    """Return a session with the zenoh router at `address`, which may start later."""
+    """Return a session with the zenoh router at `address`; it reconnects after an interruption."""
     import zenoh
 
     config = zenoh.Config()
@@ -60,7 +60,14 @@ def open_session(address: Address) -> Any:
         "scouting/multicast/enabled": False,
     }.items():
         config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise DrakeTeleopError(
+            f"no zenoh router answers on port {address.port}",
+            where=address.text,
+            remedy="check the host, and start the router: ros2 run rmw_zenoh_cpp rmw_zenohd",
+        ) from error
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
@@ -113,10 +120,10 @@ class CdrConverter(MessageConverter):
         self._types, self._damaged = message_types(), SerdeError
         self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
         for name in MESSAGE_TYPE_OF_TOPIC:  # creates the deserializers before the first message
-            self.parts_of_cdr(name, b"", b"")
+            self.readings_of_cdr(name, b"", b"")
         self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
 
-    def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
+    def readings_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Reading]:
         self._counts[name] += 1
         number = number_in_attachment(attachment)
         if number is None:
@@ -124,11 +131,11 @@ class CdrConverter(MessageConverter):
         try:
             data = self._types.deserialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])
         except self._damaged:
-            return [damaged_part_of_topic(name)]
-        return self.parts_of_message(name, data, number)
+            return [damaged_reading_of_topic(name)]
+        return self.readings_of_message(name, data, number)
 
 
-class ZenohSource:
+class ZenohSource(Source):
     """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
 
     The first TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
@@ -147,12 +154,12 @@ class ZenohSource:
                 topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream]), self._make_callback(stream)
             )
 
-    def read(self, timeout_s: float) -> list[Part] | None:
-        found: list[Part] = []
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        found: list[Reading] = []
         try:
-            found += self.messages.parts_of_cdr(*self._queue.get(timeout=timeout_s))
+            found += self.messages.readings_of_cdr(*self._queue.get(timeout=timeout_s))
             while len(found) < _MAX_QUEUED_MESSAGES:
-                found += self.messages.parts_of_cdr(*self._queue.get_nowait())
+                found += self.messages.readings_of_cdr(*self._queue.get_nowait())
         except queue.Empty:
             pass
         return found
