@@ -19,20 +19,14 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array, broadcast_to_rows
-from drake_teleop.common.vectors import copy_into
+from drake_teleop.load.moments import regressor_coefficients
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
-    add_outer_product,
-    allocate_scratch,
-    eliminate_rows,
     forget_samples,
-    invert_matrix,
-    nonzero_regressor_terms,
+    products_vector,
     residual_products,
-    solve_linear_system,
-    weighted_gram,
-    weighted_right_side,
-    write_products_vector,
+    solve_with_ridge,
+    weighted_normal_equations,
 )
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
@@ -48,45 +42,30 @@ _ROUNDING_SQUARE = 1e-13
 
 
 @njit(cache=True)
-def riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A):
-    """Write R^T M^-1 R + prior and R^T M^-1 g + prior theta_0 into A (16, 17).
+def riv_normal_equations(memory, theta, noise_std, information, T):
+    """Return R^T M^-1 R + prior (16, 16) and R^T M^-1 g + prior theta_0 (16,).
 
     Args:
         memory: (58, 19) sums of z z^T, y z^T, y y^T (y of the instruments), and the prior's part.
         theta: (16,) estimate, for the weights.
         noise_std: (6,) of the wrench [N, N m].
         information: (16,) of the prior.
-        index, factors: from `terms`, space: from `scratch`, MRg: (16, 33) scratch.
+        T: `regressor_coefficients`.
     """
-    E, g, L, LZ, inverse, S, W = space
     measured, mixed, instruments = memory[:19], memory[19:38], memory[38:57]
-    residual_products(measured, theta, index, factors, L, LZ, S)
+    S = residual_products(measured, theta, T)
     for c in range(6):
-        S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[13 + c, 13 + c]
-        for d in range(6):
-            S[c, d] /= measured[0, 0] + _NOISE_SAMPLES
-    invert_matrix(S, inverse, W)
-    weighted_gram(instruments, W, index, factors, E, MRg, 0)
-    weighted_gram(mixed, W, index, factors, E, MRg, 16)
-    weighted_right_side(mixed[:, 13:].T, W, index, factors, g)
-    for i in range(16):
-        MRg[i, 32] = g[i]
-        MRg[i, i] += _RIDGE * MRg[i, i] + information[i]
-        for j in range(17):
-            A[i, j] = 0.0
-        A[i, i] = information[i]
-        A[i, 16] = memory[57, i]
-    eliminate_rows(MRg)
-    for k in range(16):
-        pivot = 1.0 / MRg[k, k]
-        for i in range(16):
-            factor = pivot * MRg[k, 16 + i]
-            for j in range(17):
-                A[i, j] += factor * MRg[k, 16 + j]
+        S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[1 + c, 1 + c]
+    W = np.linalg.inv(S / (measured[0, 0] + _NOISE_SAMPLES))
+    M, _ = weighted_normal_equations(instruments, W, T)
+    R, g = weighted_normal_equations(mixed, W, T)
+    M += np.diag(_RIDGE * np.diag(M) + information)
+    projected = np.linalg.solve(M, R).T
+    return np.dot(projected, R) + np.diag(information), np.dot(projected, g) + memory[57, :16]
 
 
 @njit(cache=True)
-def riv_update(theta, memory, samples, noise_std, forgetting, information, index, factors):
+def riv_update(theta, memory, samples, noise_std, forgetting, information, T):
     """Update the estimate by each sample; compiled, without checks.
 
     Args:
@@ -95,20 +74,16 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         samples: (N, 24) [wrench, s, omega, alpha, instruments (s, omega, alpha)].
         forgetting: factor per sample on the weight of the past.
     """
-    space, MRg, A = allocate_scratch(), np.empty((16, 33)), np.empty((16, 17))
-    y, z = np.empty(19), np.empty(19)
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget_samples(memory, theta, information, forgetting)
-        wrench = samples[n, SAMPLE_WRENCH]
-        write_products_vector(wrench, samples[n, SAMPLE_MOTION], z)
-        write_products_vector(wrench, samples[n, INSTRUMENTS], y)
-        add_outer_product(z, z, memory[:19])
-        add_outer_product(y, z, memory[19:38])
-        add_outer_product(y, y, memory[38:57])
-        riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
-        solve_linear_system(A)
-        copy_into(theta, 0, A[:, 16], 0, 16)
+        z = products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION])
+        y = products_vector(samples[n, SAMPLE_WRENCH], samples[n, INSTRUMENTS])
+        memory[:19] += np.outer(z, z)
+        memory[19:38] += np.outer(y, z)
+        memory[38:57] += np.outer(y, y)
+        A, b = riv_normal_equations(memory, theta, noise_std, information, T)
+        theta[:] = solve_with_ridge(A, b)
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):
@@ -124,10 +99,9 @@ class RecursiveInstrumentalVariables(MomentEstimator):
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """Return the covariance (16, 16), (R^T M^-1 R + prior)^-1."""
-        A, MRg = np.empty((16, 17)), np.empty((16, 33))
-        options = (self._noise_std, 1.0 / self._prior, *nonzero_regressor_terms())
-        riv_normal_equations(memory, theta, *options, allocate_scratch(), MRg, A)
-        return self._limit_variances_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
+        options = (self._noise_std, 1.0 / self._prior, regressor_coefficients())
+        A, _ = riv_normal_equations(memory, theta, *options)
+        return self._limit_variances_to_prior(np.linalg.inv(0.5 * (A + A.T)))
 
     def update_samples(
         self,
@@ -144,5 +118,5 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         self._samples += len(rows[0])
 
     def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
-        options = (self._noise_std, self._forgetting, 1.0 / self._prior, *nonzero_regressor_terms())
+        options = (self._noise_std, self._forgetting, 1.0 / self._prior, regressor_coefficients())
         riv_update(theta, memory, samples, *options)

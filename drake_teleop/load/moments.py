@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
+from drake_teleop.common.numeric import (
+    Array,
+    broadcast_to_rows,
+    finite_array,
+    nonnegative_array,
+    positive_array,
+)
 from drake_teleop.load.regressor import regressor
 
 _MAX_MOMENT_BLOCKS = 1024
@@ -24,8 +30,8 @@ SAMPLES_PER_CHUNK = 2**15
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
 # `normal_equations`.
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RMS_EXCITATION = 1e-12, 1e-9
-# Indices of the products w_i w_j in z.
-_OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+"""Indices of the products w_i w_j in z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,23 +52,11 @@ class NoiseStd:
     motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        walk = finite_array("noise.walk", np.broadcast_to(self.walk, 12), 12)
-        if (walk < 0.0).any():
-            raise DrakeTeleopError(
-                f"has the negative value {walk.min():g}",
-                where="noise.walk",
-                remedy="give steps of 0 or more",
-            )
-        rows = []
-        for name in ("s", "omega", "alpha"):
-            std = finite_array(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
-            if (std < 0.0).any():
-                raise DrakeTeleopError(
-                    f"has the negative value {std.min():g}",
-                    where=f"noise.{name}",
-                    remedy="give standard deviations of 0 or more",
-                )
-            rows.append(std)
+        nonnegative_array("noise.walk", np.broadcast_to(self.walk, 12), 12)
+        rows = [
+            nonnegative_array(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
+            for name in ("s", "omega", "alpha")
+        ]
         object.__setattr__(self, "motion", np.stack(rows))
         if self.wrench is not None:
             positive_array("noise.wrench", self.wrench, 6)
@@ -115,9 +109,9 @@ class SecondMoments:
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
-        products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
+        products = self.mean_products[0, OMEGA_PRODUCT_INDICES]
         for std, J in zip(
-            noise.motion[1], omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19), strict=True
+            noise.motion[1], omega_product_jacobians(OMEGA_PRODUCT_INDICES, 19), strict=True
         ):
             Q += std**2 * J.T @ products @ J
         return Q

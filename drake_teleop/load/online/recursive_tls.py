@@ -1,25 +1,21 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
 The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
-2008). Row c of the regressor [E V] is T_c z with constant T_c; [G g] are the normal equations, and
-Z (19, 19) is the sum of z z^T, with w = omega:
-
-    z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
+2008). Row c of the regressor [E V] is T_c z with the constant T_c and the products z (19) of
+`load.moments`; Z (19, 19) is the sum of z z^T, and [G g] are the normal equations.
 """
 
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.moments import regressor_coefficients
+from drake_teleop.load.moments import OMEGA_PRODUCT_INDICES, regressor_coefficients
 from drake_teleop.load.online.recursive import (
     MAX_SETTLED_RELATIVE_STD,
     PRIOR_STD,
@@ -29,10 +25,7 @@ from drake_teleop.load.online.recursive import (
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 # Relative increase of diagonal elements against rounding.
-RELATIVE_RIDGE = 1e-13
-# Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
-_WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
+_RELATIVE_RIDGE = 1e-13
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
@@ -41,173 +34,69 @@ _MIN_RELATIVE_PIVOT = 1e-13
 _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 
 
-@cache
-def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
-    """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
-    T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
-    index = np.argwhere(T)
-    # Unsigned, so that the compiled loops do not check for negative indices.
-    return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
-
-
 @njit(cache=True)
-def allocate_scratch():
-    return (
-        np.empty((13, 6, 16)),
-        np.empty(16),
-        np.empty((6, 19)),
-        np.empty((6, 19)),
-        np.empty((6, 12)),
-        np.empty((6, 6)),
-        np.empty((6, 6)),
-    )
-
-
-@njit(cache=True)
-def write_products_vector(wrench, motion, z):
-    s, omega, alpha = motion[:3], motion[3:6], motion[6:]
-    z[0] = 1.0
+def products_vector(wrench, motion):
+    """Return z (19,) of a sample with motion [s, omega, alpha] (9,)."""
+    z, omega = np.ones(19), motion[3:6]
+    z[1:7], z[7:10], z[10:13] = wrench, motion[:3], motion[6:]
     for i in range(3):
-        z[1 + i] = s[i]
-        z[4 + i] = alpha[i]
         for j in range(i + 1):
-            z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
-    for c in range(6):
-        z[_WRENCH_START_IN_Z + c] = wrench[c]
-
-
-@njit(cache=True)
-def add_outer_product(y, z, total):
-    for i in range(19):
-        for j in range(19):
-            total[i, j] += y[i] * z[j]
+            z[OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
+    return z
 
 
 @njit(cache=True)
 def forget_samples(memory, theta, information, forgetting):
     """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
-    last = memory.shape[0] - 1
-    for i in range(last):
-        for j in range(19):
-            memory[i, j] *= forgetting
-    for j in range(16):
-        memory[last, j] = information[j] * theta[j]
+    memory[:-1] *= forgetting
+    memory[-1, :16] = information * theta
 
 
 @njit(cache=True)
-def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, LZ = L Z and S = L Z L^T (6, 6), where r = F - [E V] theta = L z is the residual."""
-    L[:] = 0.0
-    LZ[:] = 0.0
+def residual_products(Z, theta, T):
+    """Return the sum (6, 6) of r r^T, where r = F - [E V] theta is the residual."""
+    L = np.zeros((6, 19))
     for c in range(6):
-        L[c, _WRENCH_START_IN_Z + c] = 1.0
-    for t in range(len(factors)):
-        L[index[t, 0], index[t, 1]] -= factors[t] * theta[index[t, 2]]
-    for c in range(6):
-        for i in range(19):
-            a = L[c, i]
-            if a != 0.0:
-                for j in range(19):
-                    LZ[c, j] += a * Z[i, j]
-    for c in range(6):
-        for d in range(c + 1):
-            total = 0.0
-            for j in range(19):
-                total += LZ[c, j] * L[d, j]
-            S[c, d] = S[d, c] = total
+        L[c] = -np.dot(theta, T[c])
+        L[c, 1 + c] += 1.0
+    return np.dot(np.dot(L, Z), L.T)
 
 
 @njit(cache=True)
-def noise_products(Z, noise_std, motion_std, Q):
-    """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
-    Q[:] = 0.0
-    for c in range(6):
-        Q[_WRENCH_START_IN_Z + c, _WRENCH_START_IN_Z + c] = Z[0, 0] * noise_std[c] ** 2
+def noise_products(Z, noise_std, motion_std):
+    """Return the part Q (19, 19) of Z, the sum of z z^T, that noise is expected to cause."""
+    Q = np.zeros((19, 19))
+    for k in range(6):
+        Q[1 + k, 1 + k] = Z[0, 0] * noise_std[k] ** 2
     for k in range(3):
-        Q[1 + k, 1 + k] = Z[0, 0] * motion_std[k] ** 2
-        Q[4 + k, 4 + k] = Z[0, 0] * motion_std[6 + k] ** 2
+        Q[7 + k, 7 + k] = Z[0, 0] * motion_std[k] ** 2
+        Q[10 + k, 10 + k] = Z[0, 0] * motion_std[6 + k] ** 2
         # The derivative of w_i w_k by w_k is w_i, or 2 w_i for i = k.
         for i in range(3):
             for j in range(3):
-                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCT_INDICES[i, j]]
-                Q[_OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]] += (
-                    motion_std[3 + k] ** 2 * both
-                )
+                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, OMEGA_PRODUCT_INDICES[i, j]]
+                row, column = OMEGA_PRODUCT_INDICES[i, k], OMEGA_PRODUCT_INDICES[j, k]
+                Q[row, column] += motion_std[3 + k] ** 2 * both
+    return Q
 
 
 @njit(cache=True)
-def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
-    E[:] = 0.0
-    for t in range(len(factors)):
-        c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
-        for a in range(13):
-            E[a, c, k] += factor * Z[a, b]
-    G[:, first : first + 16] = 0.0
-    for t in range(len(factors)):
-        c, a, j, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
-        w0, w1, w2 = factor * W[c, 0], factor * W[c, 1], factor * W[c, 2]
-        w3, w4, w5 = factor * W[c, 3], factor * W[c, 4], factor * W[c, 5]
-        for k in range(16):
-            G[j, first + k] += (
-                (w0 * E[a, 0, k] + w1 * E[a, 1, k])
-                + (w2 * E[a, 2, k] + w3 * E[a, 3, k])
-                + (w4 * E[a, 4, k] + w5 * E[a, 5, k])
-            )
-
-
-@njit(cache=True)
-def weighted_right_side(LZ, W, index, factors, g):
-    """Write the sum of X^T W r into g (16,); LZ sums r z^T, X is [E V] of z."""
-    g[:] = 0.0
-    for t in range(len(factors)):
-        c, a = index[t, 0], index[t, 1]
-        total = 0.0
-        for d in range(6):
-            total += W[c, d] * LZ[d, a]
-        g[index[t, 2]] += factors[t] * total
-
-
-@njit(cache=True)
-def eliminate_rows(A):
-    """Replace [A B] by [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
-    n, m = A.shape
-    for k in range(n):
-        inverse = 1.0 / A[k, k]
-        for i in range(k + 1, n):
-            factor = A[k, i] * inverse
-            # Whole rows, although the first part is eliminated: equal loops are vectorised better.
-            for j in range(m):
-                A[i, j] -= factor * A[k, j]
-
-
-@njit(cache=True)
-def solve_linear_system(A):
-    """Replace the right part of [A B] by A^-1 B in place, A symmetric and positive definite."""
-    n, m = A.shape
-    for i in range(n):
-        A[i, i] *= 1.0 + RELATIVE_RIDGE
-    eliminate_rows(A)
-    for i in range(n - 1, -1, -1):
-        for j in range(n, m):
-            x = A[i, j] / A[i, i]
-            A[i, j] = x
-            for k in range(i):
-                A[k, j] -= A[k, i] * x
-
-
-@njit(cache=True)
-def invert_matrix(S, A, W):
-    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch memory."""
+def weighted_normal_equations(Z, W, T):
+    """Return the sums of Y^T W X and Y^T W F; Z sums y z^T, and Y, X are [E V] of y, z."""
+    TZ = np.dot(T.reshape(96, 19), Z).reshape(6, 304)
+    weighted = np.dot(W, TZ).reshape(6, 16, 19)
+    gram, right = np.zeros((16, 16)), np.zeros(16)
     for c in range(6):
-        for d in range(6):
-            A[c, d] = S[c, d]
-            A[c, 6 + d] = 0.0
-        A[c, 6 + c] = 1.0
-    solve_linear_system(A)
-    for c in range(6):
-        for d in range(6):
-            W[c, d] = A[c, 6 + d]
+        gram += np.dot(weighted[c], T[c].T)
+        right += weighted[c, :, 1 + c]
+    return gram, right
+
+
+@njit(cache=True)
+def solve_with_ridge(A, b):
+    for i in range(A.shape[0]):
+        A[i, i] *= 1.0 + _RELATIVE_RIDGE
+    return np.linalg.solve(A, b)
 
 
 class MomentEstimator(RecursiveEstimator):
@@ -219,9 +108,8 @@ class MomentEstimator(RecursiveEstimator):
         return memory
 
     def _residual_rms(self) -> Array:
-        L, LZ, S = np.empty((6, 19)), np.empty((6, 19)), np.empty((6, 6))
-        residual_products(self._memory[:19], self._theta, *nonzero_regressor_terms(), L, LZ, S)
-        return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
+        squares = residual_products(self._memory[:19], self._theta, regressor_coefficients())
+        return np.sqrt(np.maximum(np.diag(squares), 0.0) / self._memory[0, 0])
 
     def _limit_variances_to_prior(self, covariance: Array) -> Array:
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
@@ -229,18 +117,9 @@ class MomentEstimator(RecursiveEstimator):
 
 
 @njit(cache=True)
-def select_compensated_parameters(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise N can be removed from G, otherwise to 0."""
-    taper[:] = 1.0
-    for i in range(16):
-        for j in range(16):
-            K[i, j] = G[i, j] - strength * N[i, j]
-    eliminate_rows(K)
-    definite = True
-    for i in range(16):
-        definite &= K[i, i] > _MIN_RELATIVE_PIVOT * G[i, i]
-    if definite:
-        return
+def select_compensated_parameters(G, N, strength):
+    """Return (16,) 1 for parameters whose noise N can be removed from G, otherwise 0."""
+    taper, K = np.ones(16), np.zeros((16, 16))
     for i in range(16):
         for attempt in range(2):
             taper[i] = 1.0 - attempt
@@ -255,64 +134,43 @@ def select_compensated_parameters(G, N, strength, K, taper):
             if total > _MIN_RELATIVE_PIVOT * G[i, i]:
                 break
         if not total > _MIN_RELATIVE_PIVOT * G[i, i]:
-            taper[:] = 0.0
-            return
+            return np.zeros(16)
         K[i, i] = math.sqrt(total)
+    return taper
 
 
 @njit(cache=True)
-def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G, its part from noise into N; return the ratio of actual to given noise."""
-    E, g, L, LZ, inverse, S, W = space
-    noise_products(Z, noise_std, motion_std, Q)
-    residual_products(Q, theta, index, factors, L, LZ, S)
-    for c in range(6):
-        for d in range(6):
-            S[c, d] /= Z[0, 0]
-    invert_matrix(S, inverse, W)
-    residual_products(Z, theta, index, factors, L, LZ, S)
-    scale = 0.0
-    for c in range(6):
-        for d in range(6):
-            scale += W[c, d] * S[c, d]
-    weighted_gram(Z, W, index, factors, E, G, 0)
-    weighted_gram(Q, W, index, factors, E, N, 0)
-    weighted_right_side(Z[:, 13:].T, W, index, factors, g)
-    for i in range(16):
-        G[i, 16] = g[i]
-    return max(0.0, scale) / (6.0 * Z[0, 0])
+def rtls_normal_equations(Z, theta, noise_std, motion_std, T):
+    """Return G, g, the part N of G from noise, and the ratio of actual to given noise."""
+    Q = noise_products(Z, noise_std, motion_std)
+    W = np.linalg.inv(residual_products(Q, theta, T) / Z[0, 0])
+    scale = max(0.0, (W * residual_products(Z, theta, T)).sum()) / (6.0 * Z[0, 0])
+    G, g = weighted_normal_equations(Z, W, T)
+    return G, g, weighted_normal_equations(Q, W, T)[0], scale
 
 
 @njit(cache=True)
-def rtls_update(
-    theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
-):
+def rtls_update(theta, memory, samples, noise_std, motion_std, forgetting, information, T):
     """Update theta (16,) and memory (20, 19) of recursive total least squares by N samples.
 
     `noise_std` (6,) and `motion_std` (9,) are standard deviations of the wrench and of [s, omega,
-    alpha]; `information` (16,) are inverse variances of the prior.
+    alpha]; `information` (16,) are inverse variances of the prior; T: `regressor_coefficients`.
     """
-    space, Q, z, taper = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
-    G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
-    Z, options = memory[:19], (noise_std, motion_std, index, factors)
+    Z = memory[:19]
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget_samples(memory, theta, information, forgetting)
-        write_products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION], z)
-        add_outer_product(z, z, Z)
-        scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
-        for i in range(16):
-            G[i, i] += information[i]
-            G[i, 16] += memory[19, i]
+        z = products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION])
+        Z += np.outer(z, z)
+        G, g, N, scale = rtls_normal_equations(Z, theta, noise_std, motion_std, T)
+        G += np.diag(information)
+        g += memory[19, :16]
         gain = 1.0 - _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
-            select_compensated_parameters(G, N, scale / gain, K, taper)
-            for i in range(6, 16):
-                for j in range(6, 16):
-                    G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
-        solve_linear_system(G)
-        for i in range(16):
-            theta[i] = G[i, 16]
+            taper = select_compensated_parameters(G, N, scale / gain)
+            taper[:6] = 0.0
+            g += scale * taper * np.dot(N, taper * theta)
+        theta[:] = solve_with_ridge(G, g)
 
 
 class RecursiveTotalLeastSquares(MomentEstimator):
@@ -332,13 +190,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         prior_std: ArrayLike = PRIOR_STD,
         bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
-        self._motion_std = finite_array("motion_std", motion_std, 9)
-        if (self._motion_std < 0.0).any():
-            raise DrakeTeleopError(
-                f"has the negative value {self._motion_std.min():g}",
-                where="motion_std",
-                remedy="give standard deviations of 0 or more",
-            )
+        self._motion_std = nonnegative_array("motion_std", motion_std, 9)
         super().__init__(noise_std, forgetting, prior_std, bound)
 
     @classmethod
@@ -370,22 +222,15 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._limit_variances_to_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
-        G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
-            return G[:, :16], N, 1.0
-        options = (
-            self._noise_std,
-            self._motion_std,
-            *nonzero_regressor_terms(),
-            allocate_scratch(),
-            Q,
-        )
-        scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
-        return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
+            return np.zeros((16, 16)), np.zeros((16, 16)), 1.0
+        noise, T = (self._noise_std, self._motion_std), regressor_coefficients()
+        G, _, N, scale = rtls_normal_equations(memory[:19], theta, *noise, T)
+        return G, N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
 
     def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)
-        rtls_update(theta, memory, samples, *options, *nonzero_regressor_terms())
+        rtls_update(theta, memory, samples, *options, regressor_coefficients())
 
 
 def _regularized_cholesky(A: Array) -> Array:
