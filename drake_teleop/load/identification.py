@@ -109,6 +109,9 @@ class Identification:
         )
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
+    def with_unidentified_load(self) -> Identification:
+        return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
+
     def __repr__(self) -> str:
         deviations = self.standard_deviations
         named = zip(PARAMETER_NAMES, self.verdicts, strict=True)
@@ -251,6 +254,13 @@ def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool
     return standard_deviations <= MAX_IDENTIFIED_STD_SHARE * natural_scales(phi)
 
 
+def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+    """Return the covariance (n, n) with variance inf, and no correlation, of flagged parameters."""
+    out = np.where(undetermined[:, None] | undetermined, 0.0, covariance)
+    out[undetermined, undetermined] = np.inf
+    return out
+
+
 def natural_scales(phi: Array) -> Array:
     """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
     m = abs(phi[0])
@@ -336,8 +346,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     covariance = total.covariance.copy()
     covariance[6:, 6:] += gripper.covariance[6:, 6:]
     undetermined = np.isinf(np.diag(covariance))
-    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-    covariance[undetermined, undetermined] = np.inf
+    covariance = mark_undetermined(covariance, undetermined)
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(

@@ -8,7 +8,11 @@ from scipy.special import fdtrc
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array, to_float
-from drake_teleop.load.identification import Identification, is_precise_enough
+from drake_teleop.load.identification import (
+    Identification,
+    is_precise_enough,
+    mark_undetermined,
+)
 from drake_teleop.load.moments import (
     SecondMoments,
     excited_columns,
@@ -59,8 +63,8 @@ class NormalEquations(SecondMoments):
                 remedy="check that the sensor is connected and that its orientation changes",
             )
         covariance, degrees = self._covariance_and_degrees(theta, inverse)
-        covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-        covariance[undetermined, undetermined] = degrees[undetermined] = np.inf
+        covariance = mark_undetermined(covariance, undetermined)
+        degrees[undetermined] = np.inf
         return Identification(
             phi=theta[6:],
             offsets=theta[:6],
@@ -158,10 +162,8 @@ class NormalEquations(SecondMoments):
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, counted, degrees)
             found |= enough
-            has_motion = (
-                self._absorbed_degrees_of_freedom(between, inverse)
-                >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_absorbed
-            )
+            absorbed = self._absorbed_degrees_of_freedom(between, inverse)
+            has_motion = absorbed >= _MIN_FIT_DOF_SHARE_IN_BLOCKS * sample_absorbed
             is_longest = has_motion & (counted >= _MIN_DOF_OF_LONGEST_BLOCKS)
             longest = np.where(is_longest, estimated, longest)
             longest_degrees = np.where(is_longest, counted, longest_degrees)

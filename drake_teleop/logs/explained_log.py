@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,9 @@ from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passe
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.table_files import TABLE_READERS
+from drake_teleop.logs.read.table_files import yaml_only_note
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
@@ -72,7 +71,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{yaml_only_note(log)}"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{yaml_only_note(log.source)}"
     )
 
 
@@ -97,12 +96,8 @@ def _correct_fields(
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{yaml_only_note(log)}" if lines else otherwise)
+        texts.append(f"set {lines}{yaml_only_note(log.source)}" if lines else otherwise)
     return fields, texts, corrected
-
-
-def yaml_only_note(log: Log) -> str:
-    return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
 def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -314,7 +309,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         offsets=why.theta[:6],
         covariance=why.covariance,
         identifiable=identifiable,
-        residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
+        residual_rms=why.state.rows.residual_rms(why.state.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
         or "weight" in why.always_fitted,
         prior_dominated=np.zeros(16, bool),

@@ -288,9 +288,8 @@ def _inspect_clock(
         )
         findings.append(Finding("gap", text))
     if back:
-        row = table.line_in_file(
-            np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1]
-        )
+        finite = np.flatnonzero(np.isfinite(stamps))
+        row = table.line_in_file(finite[int(np.argmax(steps <= 0)) + 1])
         text = (
             f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
             " rows with equal stamps are omitted or spread evenly; a log with decreasing"

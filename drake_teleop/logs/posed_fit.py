@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
-from drake_teleop.load.identification import Identification, is_precise_enough
+from drake_teleop.load.identification import (
+    Identification,
+    is_precise_enough,
+    mark_undetermined,
+)
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import (
@@ -20,20 +24,18 @@ from drake_teleop.logs.aligned_log import (
 )
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_unit_or_frame_finding
-from drake_teleop.logs.explained_log import yaml_only_note
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.table_files import yaml_only_note
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
-# Fewest kept samples, and largest cut-off of the low-pass over their rate.
+# Fewest kept samples, and largest cut-off of the low-pass over their rate; kept samples per chunk,
+# and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
-_CHUNK_SAMPLES, _FILTER_NEIGHBOURS = (
-    2**14,
-    2**8,
-)  # kept samples per chunk, and neighbours for smoothing
+_CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
 
 
 @dataclass(frozen=True)
@@ -75,11 +77,10 @@ def fit_load_to_posed_log(
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
     if finding is not None or not found.fit.is_explained_by_gains:
-        flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
-        fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
+        fit = replace(fit, identification=fit.identification.with_unidentified_load())
     if finding is not None:
         fit = replace(fit, note="")
-        finding = replace(finding, message=f"{finding.message}{yaml_only_note(log)}")
+        finding = replace(finding, message=f"{finding.message}{yaml_only_note(log.source)}")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
@@ -112,10 +113,8 @@ def _batch_result_of_estimate(
     equations = NormalEquations(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
     equations.add_samples(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
-    covariance = found.covariance.copy()
-    unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(covariance))
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
+    unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(found.covariance))
+    covariance = mark_undetermined(found.covariance, unknown)
     load: Identification = replace(
         plain,
         phi=theta[6:],

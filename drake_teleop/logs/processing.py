@@ -213,25 +213,18 @@ def _read_and_identify_log(
         )
     result = fit.identification
     motion = None if posed is None else posed.motion
-    why = (
-        explain_log(raw, delay_s, motion)
-        if _is_explanation_possible(raw, posed is not None)
-        else None
-    )
-    if (
-        why is not None
-        and log.gain_std > 0.0
-        and {x.name for x in why.causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
-    ):
+    why = None
+    if _is_explanation_possible(raw, posed is not None):
+        why = explain_log(raw, delay_s, motion)
+    names = {x.name for x in why.causes} if why is not None else set()
+    if why is not None and log.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
     if errors:
-        why = None
-        known = result.identifiable & np.repeat([True, False], [6, 10])
-        result = replace(result, identifiable=known)
+        why, result = None, result.with_unidentified_load()
     if why is not None:
         result = explained_load(result, why)
         causes = replace_frame_causes(why, other[0]) if other else why.causes
@@ -241,7 +234,7 @@ def _read_and_identify_log(
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
+    findings = _findings_of_causes(causes)
     if errors:
         findings = errors
     elif not causes and not raw.estimated:
@@ -252,23 +245,16 @@ def _read_and_identify_log(
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
-        result = replace(
-            result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
-        )
-    base = base_parameters(fit.equations)
-    loads = () if why is None else why.loads
+        result = result.with_unidentified_load()
     return IdentifiedLog(
-        log,
-        result,
-        predicted,
-        source,
-        fit.rejected,
-        base,
-        findings,
-        causes,
-        loads,
+        *(log, result, predicted, source, fit.rejected, base_parameters(fit.equations)),
+        *(findings, causes, () if why is None else why.loads),
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
+
+
+def _findings_of_causes(causes: tuple[Cause, ...]) -> tuple[Finding, ...]:
+    return tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
 
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
@@ -292,12 +278,8 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
-        causes = tuple(
-            Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
-        )
-        return replace(
-            checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
-        )
+        delay = own_delay if np.isfinite(deviation) else delay
+        return replace(checks, findings=_findings_of_causes(identified.causes), delay_s=delay)
     if all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described
@@ -433,15 +415,9 @@ def _read_and_eliminate_log(
         )
     phi, point_mass = usable_phi(identification)
     phi_object = phi - phi_gripper
-    aligned = read_aligned_log(
-        path,
-        phi,
-        identification.delay_s,
-        cutoff_hz,
-        delay,
-        causal is not None,
-        identification.weight_removed,
-    )
+    known_load = phi, identification.delay_s
+    removed = identification.weight_removed
+    aligned = read_aligned_log(path, *known_load, cutoff_hz, delay, causal is not None, removed)
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
         raise DrakeTeleopError(
@@ -453,20 +429,18 @@ def _read_and_eliminate_log(
     def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    span = (
-        slice(None) if untouched_s is None else _rows_in_span(log.select_rows(known), *untouched_s)
-    )
+    shown = log.select_rows(known)
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
-            return residual[span].mean(axis=0), 1.0
+            return residual[_rows_in_span(shown, *untouched_s)].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
     offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
-    removed = identification.weight_removed or "weight" in log.estimated
+    removed = removed or "weight" in log.estimated
     _require_gravity_for_scales(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
@@ -484,17 +458,14 @@ def _read_and_eliminate_log(
         motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(
-                axis=0
-            )
-        causal_wrench = compute_causal_wrench(
+            rows = _rows_of_contact_free_start(log, causal_tare_s)
+            causal_offsets = untouched[rows].mean(axis=0)
+        both = (
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
             scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
-            log.dt,
-            cutoff_hz=cutoff_hz,
-            delay_s=delay_s,
-            mode=causal,
         )
+        options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
+        causal_wrench = compute_causal_wrench(*both, log.dt, **options)
         causal_wrench = replace(
             causal_wrench,
             offsets=causal_offsets,
@@ -503,7 +474,7 @@ def _read_and_eliminate_log(
         )
     contact = low_pass_wrench(contact)
     return EliminatedLog(
-        log=log.select_rows(known),
+        log=shown,
         phi=phi,
         point_mass_inertias=point_mass,
         offsets=offsets,
@@ -535,7 +506,7 @@ def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     return rows
 
 
-def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> Array:
+def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
@@ -544,7 +515,7 @@ def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> 
             where="causal_tare_s",
             remedy="give another contact-free start",
         )
-    return wrench[rows]
+    return rows
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:

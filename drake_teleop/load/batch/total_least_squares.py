@@ -122,11 +122,9 @@ def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: fl
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
 
-    return (
-        highest
-        if determinant_condition(highest) >= 0.0
-        else float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
-    )
+    if determinant_condition(highest) >= 0.0:
+        return highest
+    return float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
 
 
 @dataclass(frozen=True, eq=False)

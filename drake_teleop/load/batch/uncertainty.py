@@ -16,6 +16,7 @@ from drake_teleop.load.identification import (
     MAX_IDENTIFIED_STD_SHARE,
     PARAMETER_NAMES,
     Identification,
+    mark_undetermined,
     natural_scales,
 )
 from drake_teleop.load.moments import (
@@ -199,10 +200,7 @@ def covariance_for_white_noise(
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
     covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
-    unknown = np.isinf(np.diag(plain))
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
+    return mark_undetermined(covariance, np.isinf(np.diag(plain)))
 
 
 def _inverse_gram(fit: EstimatorFit) -> Array:
@@ -270,7 +268,4 @@ def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Arr
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
     covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
-    unknown = unknown | form.is_undetermined
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
+    return mark_undetermined(covariance, unknown | form.is_undetermined)

@@ -25,10 +25,8 @@ MAX_SUMMED_SAMPLES = 128
 NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
 """Number of windows: 1, 2, 4 ... MAX_SUMMED_SAMPLES samples."""
 
-HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
-    1,
-    2,
-)  # indices of held squares in the memory of a detector
+# Indices of held squares in the memory of a detector.
+HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = 1, 2
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
@@ -175,10 +173,8 @@ def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, ou
         hold_acceleration_peaks(memory, acceleration[k], alpha[k], fade)
         wrench_variance_by_parameters_into(s[k], omega[k], alpha[k], P, V, out[k])
         for c in range(6):
-            moving = (
-                growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
-                + growth[c, 1] * memory[HELD_ALPHA_INDEX]
-            )
+            moving = growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
+            moving += growth[c, 1] * memory[HELD_ALPHA_INDEX]
             out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
 
 

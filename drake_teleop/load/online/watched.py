@@ -135,18 +135,13 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == STATE_KNOWN:
         memory[_STATE_INDEX] = STATE_SETTLED
-        if (
-            at_rest
-            and (np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6]) <= MAX_OFFSET_RESIDUAL).all()
-        ):
+        low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
+        if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        other = (
-            verdict == STATE_CHANGED
-            and force_changed
-            and _is_com_within_reach(known, stored_new_load(watch))
-        )
+        near = _is_com_within_reach(known, stored_new_load(watch))
+        other = verdict == STATE_CHANGED and force_changed and near
         memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
     if memory[_STATE_INDEX] == STATE_OTHER_LOAD:

@@ -69,20 +69,18 @@ def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cau
         "linear drift": _drift_cause,
         "drift": _drift_cause,
     }
-    out += [
-        makers[name](state)
-        for name in model.extensions
-        if name in makers and name not in always_fitted
-    ]
+    named = [name for name in model.extensions if name in makers and name not in always_fitted]
+    out += [makers[name](state) for name in named]
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
     changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
-    contacts = [
-        span for span in state.contact_spans if not _is_hand_contact(span, model.step_times)
+    changes += [
+        _contact_cause(start + margin, stop - margin)
+        for start, stop in state.contact_spans
+        if not _is_hand_contact((start, stop), model.step_times)
     ]
-    changes += [_contact_cause(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
@@ -92,12 +90,12 @@ def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWit
     if not loads:
         return []
     first, last = float(state.data.t[0]), float(state.data.t[-1])
-    ratio = np.sqrt(np.diag(covariance) / np.diag(state.fit.covariance)[:16])
+    ratio = np.sqrt(np.diag(covariance) / np.diag(state.covariance)[:16])
     map_ = np.zeros((16, state.model.size))
     map_[:, :16] = np.eye(16)
     out, start = [], first
     for time, i in [*sorted(loads), (last, -1)]:
-        spread = map_ @ state.fit.covariance @ map_.T * np.outer(ratio, ratio)
+        spread = map_ @ state.covariance @ map_.T * np.outer(ratio, ratio)
         out.append(RecordPartWithLoad(start, time, (map_ @ state.x)[6:], spread))
         if i >= 0:
             map_ = map_.copy()
@@ -141,7 +139,7 @@ def _removed_weight_cause(state: State) -> Cause:
     removed, covariance = state.parameters_of_extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
-    own = float(np.sqrt(state.fit.covariance[6, 6]))
+    own = float(np.sqrt(state.covariance[6, 6]))
     values = {"removed_mass": float(removed[0]), "removed_moment": removed[1:].tolist()}
     if abs(removed[0] - mass) < 0.02 * mass + 4.0 * np.hypot(deviation, own):
         return Cause(
@@ -255,10 +253,8 @@ def _offset_or_load_step_cause(state: State, i: int) -> Cause:
 
 
 def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    near = any(
-        span[0] - _MAX_HAND_CONTACT_TO_STEP_S < time < span[1] + _MAX_HAND_CONTACT_TO_STEP_S
-        for time in times
-    )
+    start, stop = span[0] - _MAX_HAND_CONTACT_TO_STEP_S, span[1] + _MAX_HAND_CONTACT_TO_STEP_S
+    near = any(start < time < stop for time in times)
     return near and span[1] - span[0] < _MAX_HAND_CONTACT_DURATION_S
 
 

@@ -95,10 +95,8 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
     given = _gravity_misfit(few, np.eye(3), gravity)
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
-    best, P = min(
-        ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
-        key=lambda entry: entry[0],
-    )
+    misfits = ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
+    best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
     order = np.abs(P).argmax(axis=1)
@@ -243,44 +241,33 @@ def check_imu_against_pose(
         old = np.eye(3)
         if isinstance(description.imu.frame, tuple):
             old = np.array(description.imu.frame)
-        frame = (
-            np.array(given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI)
-            @ old
-        )
+        R = given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI
+        frame = R @ old
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = (
-            f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S; set imu.frame:"
-            f" {shown}"
-        )
+        text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
-        findings.append(Finding(kind, text + oblique))
+        findings.append(Finding(kind, f"{text} set imu.frame: {shown}{oblique}"))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
     return findings, given, description
 
 
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
-    assert description.imu is not None and description.wrench is not None
-    time = description.imu.time
+    assert description.imu is not None
     if not found.clock_drift:
-        offset = time.offset - found.lag_s
+        offset = description.imu.time.offset - found.lag_s
         finding = Finding(
             "clock",
             f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
             f" set imu.time.offset: {offset:.3f}",
         )
         return finding, edit_field(description, "imu.time.offset", offset)
-    start = data.start_time_of_stream(description.imu, description) - data.start_time_of_stream(
-        description.wrench, description
-    )
-    scale = 1 / (1 + found.clock_drift)
-    lag = scale * (found.mid_record_lag_s + found.clock_drift * (start - found.mid_record_time_s))
-    offset, factor = time.offset - lag, scale * time.scale
+    late = found.mid_record_lag_s - found.clock_drift * found.mid_record_time_s
+    lag, lines, edited = data.correct_clock_drift("imu", description, late, found.clock_drift)
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
         f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
-        f" constant); set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
+        f" constant); set {lines}",
     )
-    edited = edit_field(description, "imu.time.offset", offset)
-    return finding, edit_field(edited, "imu.time.scale", factor)
+    return finding, edited

@@ -38,7 +38,6 @@ from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
-    YAML_ONLY_NOTE,
     Description,
     Imu,
     Pose,
@@ -57,7 +56,7 @@ from drake_teleop.logs.read.streams import (
     specific_force_at_So,
     uniform_times_of_streams,
 )
-from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table, yaml_only_note
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES = 3
@@ -168,9 +167,8 @@ class _LogReader:
         log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
-            log = replace(
-                log, posed=self._description.poses_with_frame(pose.recorded_poses, inertial)
-            )
+            posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
+            log = replace(log, posed=posed)
         log = log if keep_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
@@ -212,8 +210,7 @@ class _LogReader:
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
-        is_table = Path(self._source).suffix.lower() in TABLE_READERS
-        of_table = f" ({YAML_ONLY_NOTE})" if is_table else ""
+        of_table = yaml_only_note(self._source)
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -239,22 +236,15 @@ class _LogReader:
         if position is not None:
             position = resample(t, clock.t, position)
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
-        return Stream(
-            "pose",
-            t,
-            rotate_world_to_S(R_WS, acceleration - self._description.gravity_W),
-            *angular_motion(R_WS, dt, self._bandwidth_hz),
-            R_WS,
-            raw,
-        )
+        s = rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
+        return Stream("pose", t, s, *angular_motion(R_WS, dt, self._bandwidth_hz), R_WS, raw)
 
     def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._read_vectors(
-                "pose", "position", stream.position, table, clock.num_rows
-            )
+            quantity = "pose", "position", stream.position
+            position = self._read_vectors(*quantity, table, clock.num_rows)
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
         orientations = OrientationColumns(self._description, form, table, clock.num_rows, where)
