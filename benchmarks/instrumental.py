@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array, broadcast_to_rows
-from drake_teleop.load.moments import regressor_coefficients
+from drake_teleop.load.normal_equations import regressor_coefficients
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     forget_samples,

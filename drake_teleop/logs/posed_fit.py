@@ -15,7 +15,7 @@ from drake_teleop.load.identification import (
     is_precise_enough,
     mark_undetermined,
 )
-from drake_teleop.load.normal_equations import NormalEquations
+from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import (
     clock_rate_notes,
@@ -110,7 +110,7 @@ def _batch_result_of_estimate(
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
+    equations = SecondMoments(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
     equations.add_samples(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(found.covariance))

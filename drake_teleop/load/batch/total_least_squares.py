@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.moments import (
+from drake_teleop.load.normal_equations import (
     NoiseStd,
     SecondMoments,
     excited_columns,

@@ -19,14 +19,14 @@ from drake_teleop.load.identification import (
     mark_undetermined,
     natural_scales,
 )
-from drake_teleop.load.moments import (
+from drake_teleop.load.normal_equations import (
     SAMPLES_PER_CHUNK,
+    SecondMoments,
     excited_columns,
     normal_equations,
     regressor_coefficients,
     root_of_pseudo_inverse,
 )
-from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
 _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
@@ -124,7 +124,7 @@ class BaseParameters:
         return lines
 
 
-def base_parameters(equations: NormalEquations) -> BaseParameters:
+def base_parameters(equations: SecondMoments) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scales(load.phi)
@@ -188,9 +188,7 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
-def covariance_for_white_noise(
-    plain: Array, equations: NormalEquations, fit: EstimatorFit
-) -> Array:
+def covariance_for_white_noise(plain: Array, equations: SecondMoments, fit: EstimatorFit) -> Array:
     """Return the covariance (16, 16) of a fit, for noise correlated between channels only."""
     W, Z = fit.form.weights, fit.moments.mean_products
     predicted = np.linalg.inv(W)

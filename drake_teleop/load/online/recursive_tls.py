@@ -2,7 +2,7 @@
 
 The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
 2008). Row c of the regressor [E V] is T_c z with the constant T_c and the products z (19) of
-`load.moments`; Z (19, 19) is the sum of z z^T, and [G g] are the normal equations.
+`load.normal_equations`; Z (19, 19) is the sum of z z^T, and [G g] are the normal equations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.moments import OMEGA_PRODUCT_INDICES, regressor_coefficients
+from drake_teleop.load.normal_equations import OMEGA_PRODUCT_INDICES, regressor_coefficients
 from drake_teleop.load.online.recursive import (
     MAX_SETTLED_RELATIVE_STD,
     PRIOR_STD,

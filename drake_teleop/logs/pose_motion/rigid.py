@@ -12,7 +12,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
 from drake_teleop.load.identification import mark_undetermined
-from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
+from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
 from drake_teleop.logs.pose_motion.spectra import (
     NUM_MOMENT_SIGNALS,

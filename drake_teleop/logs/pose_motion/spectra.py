@@ -11,7 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.moments import omega_product_jacobians
+from drake_teleop.load.normal_equations import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
     NUM_MOTION_SIGNALS,
     PoseSplines,
