@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
+from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
-from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
+from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.causes.explain import Explanation, explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise

@@ -148,15 +148,10 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
     R, order = qr(np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T, mode="r", pivoting=True)
     dependence = solve_triangular(R[:, :rank], R[:, rank:])
     dependence[np.abs(dependence) < _MIN_COMBINATION_COEFFICIENT] = 0.0
-    combinations = []
-    for row, i in enumerate(order[:rank]):
-        c = np.zeros(16)
-        c[i] = 1.0
-        others = [int(j) for j in order[rank:]]
-        for column, j in enumerate(others):
-            if dependence[row, column] != 0.0:
-                c[j] = dependence[row, column] * scale[i] / scale[j]
-        combinations.append(scaled_combination(c, int(i)))
+    rows = np.eye(16)[order[:rank]]
+    sizes = np.where(unexcited, np.inf, scale)[order[rank:]]
+    rows[:, order[rank:]] = dependence * scale[order[:rank], None] / sizes
+    combinations = [scaled_combination(c, int(i)) for c, i in zip(rows, order[:rank], strict=True)]
     combinations.sort(key=lambda c: c.leading_index)
 
     # Principal directions of determined but not identified parameters.

@@ -94,26 +94,16 @@ class NoiseFloor:
         finite_array("per_acceleration", self.per_acceleration, 6, 2)
         correlation = finite_array("correlation", self.correlation, 6, 6)
         rho = finite_array("rho", self.rho, 6)
-        if (np.abs(rho) >= 1.0).any():
-            raise DrakeTeleopError(
-                "has a value that is not between -1 and 1",
-                where="rho",
-                remedy="call fit_noise_floor",
-            )
         positive_array("sum_widths", self.sum_widths, NUM_SUM_LENGTHS)
         finite_array("free_maxima", self.free_maxima, 3)
-        if not 0.0 <= self.fade < 1.0:
-            raise DrakeTeleopError(
-                f"{self.fade} is outside the range 0 <= fade < 1",
-                where="fade",
-                remedy="call fit_noise_floor",
-            )
-        if np.linalg.eigvalsh(correlation).min() <= 0.0:
-            raise DrakeTeleopError(
-                "the matrix is not positive definite",
-                where="correlation",
-                remedy="call fit_noise_floor",
-            )
+        indefinite = np.linalg.eigvalsh(correlation).min() <= 0.0
+        for is_wrong, where, what in (
+            ((np.abs(rho) >= 1.0).any(), "rho", "has a value that is not between -1 and 1"),
+            (not 0.0 <= self.fade < 1.0, "fade", f"{self.fade} is outside the range 0 <= fade < 1"),
+            (indefinite, "correlation", "the matrix is not positive definite"),
+        ):
+            if is_wrong:
+                raise DrakeTeleopError(what, where=where, remedy="call fit_noise_floor")
 
     def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""

@@ -167,22 +167,32 @@ def is_plausible(state: State) -> bool:
     if "cable" in parts:
         if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
-        K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _MAX_CABLE_STIFFNESS_N_M)
+        return cable_stiffness(state) < _MAX_CABLE_STIFFNESS_N_M
     return True
 
 
+def cable_stiffness(state: State) -> float:
+    """Return the largest stiffness of a cable in any direction [N/m]."""
+    K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return float(np.abs(np.linalg.eigvalsh(K)).max())
+
+
 def _is_tilt_significant(state: State) -> bool:
-    assert state.data.gravity_W is not None
-    given = state.data.gravity_W
-    true = given - state.parameters_of_extension("gravity")[0]
-    size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
-    cosine = float(true @ given) / (size * right)
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    true, angle = true_gravity_and_tilt(state)
+    error = abs(float(np.linalg.norm(true) / np.linalg.norm(state.data.gravity_W)) - 1.0)
     # Noise of the accelerations changes only the magnitude.
-    turned = np.radians(angle) > abs(size / right - 1.0)
+    turned = np.radians(angle) > error
     share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
-    return bool(angle > _MIN_GRAVITY_TILT_DEG and abs(size / right - 1.0) < share)
+    return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
+
+
+def true_gravity_and_tilt(state: State) -> tuple[Array, float]:
+    """Return the estimated gravity (3,) [m/s^2], and its angle to the described one [deg]."""
+    given = state.data.gravity_W
+    assert given is not None
+    true = given - state.parameters_of_extension("gravity")[0]
+    cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
+    return true, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def start_parameters_of_tilt_fit(state: State) -> Array | None:
@@ -224,10 +234,14 @@ def _is_removed_weight_large(state: State) -> bool:
     return bool(removed[0] > _MIN_REMOVED_MASS_SHARE * mass or moment > _MIN_REMOVED_MOMENT_ARM_M)
 
 
-def _is_drift_significant(state: State) -> bool:
+def drift_amplitudes(state: State) -> Array:
+    """Return the largest drift (6,) of the offsets from their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
-    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
-    return bool((np.abs(rows).sum(axis=1) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
+    return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
+
+
+def _is_drift_significant(state: State) -> bool:
+    return bool((drift_amplitudes(state) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
 
 
 def _torque_factor_candidates(state: State) -> Iterator[Candidate]:

@@ -9,13 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import axis_names
+from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
+from drake_teleop.logs.causes.candidates import (
+    cable_stiffness,
+    drift_amplitudes,
+    fits_with_other_torque_units,
+    true_gravity_and_tilt,
+)
 from drake_teleop.logs.causes.state import State
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
-CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
 CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
@@ -109,7 +115,7 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
 
 
 def _wrong_axes_cause(Q: Array) -> Cause:
-    rows = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in Q]
+    rows = axis_names(Q)
     what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
         what = "the wrench has the opposite sign"
@@ -117,22 +123,22 @@ def _wrong_axes_cause(Q: Array) -> Cause:
 
 
 def _gravity_direction_cause(state: State) -> Cause:
-    assert state.data.gravity_W is not None
-    change, covariance = state.parameters_of_extension("gravity")
-    given = state.data.gravity_W
-    true = given - change
-    cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    size = float(np.linalg.norm(true))
-    across = np.eye(3) - np.outer(true, true) / size**2
-    spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
-    wide = float(np.degrees(np.sqrt(spread) / size))
+    true, angle = true_gravity_and_tilt(state)
+    wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
     return Cause(
         "gravity direction",
         f"gravity is {angle:.2f} deg (+- {1.96 * wide:.2g}) off the described direction in the base"
         " of the arm",
         values={"angle_deg": angle, "gravity": true.tolist()},
     )
+
+
+def direction_std_deg(x: Array, covariance: Array) -> float:
+    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
+    size = float(np.linalg.norm(x))
+    across = np.eye(3) - np.outer(x, x) / size**2
+    spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    return float(np.degrees(np.sqrt(spread) / size))
 
 
 def _removed_weight_cause(state: State) -> Cause:
@@ -206,9 +212,7 @@ def _sensor_rotation_cause(state: State) -> Cause:
 
 
 def _drift_cause(state: State) -> Cause:
-    name = "drift" if "drift" in state.model.extensions else "linear drift"
-    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
-    size = 2.0 * np.abs(rows).sum(axis=1)
+    size = 2.0 * drift_amplitudes(state)
     return Cause(
         "drift",
         f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
@@ -218,8 +222,7 @@ def _drift_cause(state: State) -> Cause:
 
 
 def _cable_cause(state: State) -> Cause:
-    K = state.parameters_of_extension("cable")[0][3:9]
-    stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
+    stiffness = cable_stiffness(state)
     return Cause(
         "cable",
         f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import rotation_matrices, signed_permutations
+from drake_teleop.common.rotations import axis_names, rotation_matrices, signed_permutations
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
     MIN_REDUCTION_BY_EDIT,
@@ -99,20 +99,17 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
     best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
-    order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
     names = imu.angular_velocity.columns
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
-        rows = ", ".join(f"{'-' if P[i, k] < 0 else ''}{'xyz'[k]}" for i, k in enumerate(order))
         return Finding(
             "swapped axes",
-            f"{text}: its x, y, z should be its {rows}; correct imu.angular_velocity.columns, in"
-            " the file where a sign is wrong",
+            f"{text}: its x, y, z should be its {', '.join(axis_names(P))}; correct"
+            " imu.angular_velocity.columns, in the file where a sign is wrong",
         ), None
-    ordered = tuple(names[k] for k in order)
-    return Finding(
-        "swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
-    ), ordered
+    ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
+    text = f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
+    return Finding("swapped axes", text), ordered
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
@@ -125,12 +122,11 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     largest = np.sum(alike * best)
     if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_ALPHA_SHARE * largest:
         return None
-    axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or remove"
-        " it",
+        f" the gyroscope's {', '.join(axis_names(best))}; correct imu.angular_acceleration.columns,"
+        " or remove it",
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.logs.causes.cause import direction_std_deg
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
@@ -233,9 +234,7 @@ def estimate_auto_gravity(
         change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
-        across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
-        spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
-        deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
+        deviation = direction_std_deg(estimated, covariance)
     if not deviation < _MAX_GRAVITY_DIRECTION_STD_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
