@@ -349,11 +349,9 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     covariance = mark_undetermined(covariance, undetermined)
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
-        raise DrakeTeleopError(
-            f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)",
-            where="gripper",
-            remedy="give the gripper alone as gripper, and the record with the object as the load",
-        )
+        what = f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)"
+        remedy = "give the gripper alone as gripper, and the record with the object as the load"
+        raise DrakeTeleopError(what, where="gripper", remedy=remedy)
     identifiable = is_precise_enough(deviations, phi) & ~undetermined
     identifiable[6:] &= total.identifiable[6:]
     return replace(

@@ -152,11 +152,9 @@ class SecondMoments:
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
-            raise DrakeTeleopError(
-                "the fitted mass is 0: the mass cannot be identified from this wrench",
-                where="wrench",
-                remedy="check that the sensor is connected and that its orientation changes",
-            )
+            what = "the fitted mass is 0: the mass cannot be identified from this wrench"
+            remedy = "check that the sensor is connected and that its orientation changes"
+            raise DrakeTeleopError(what, where="wrench", remedy=remedy)
         covariance, degrees = self._covariance_and_degrees(theta, inverse)
         covariance = mark_undetermined(covariance, undetermined)
         degrees[undetermined] = np.inf

@@ -84,11 +84,9 @@ class FourierTrajectory:
                 *((joint, _FIELDS_PER_JOINT) for joint in joints),
             ]:
                 if unknown := sorted(fields.keys() - known):
-                    raise DrakeTeleopError(
-                        f"there is no field '{unknown[0]}'",
-                        where=str(path),
-                        remedy=f"the fields are {', '.join(sorted(known))}",
-                    )
+                    what = f"there is no field '{unknown[0]}'"
+                    remedy = f"the fields are {', '.join(sorted(known))}"
+                    raise DrakeTeleopError(what, where=str(path), remedy=remedy)
             q0, rho, delta = (
                 np.array([joint[name] for joint in joints], dtype=float)
                 for name in ("q0", "rho", "delta")
@@ -101,11 +99,9 @@ class FourierTrajectory:
         except DrakeTeleopError:
             raise
         except (AttributeError, TypeError, ValueError) as error:
-            raise DrakeTeleopError(
-                f"is not a trajectory ({error})",
-                where=str(path),
-                remedy="give each joint one q0, and one rho and delta per harmonic",
-            ) from None
+            what = f"is not a trajectory ({error})"
+            remedy = "give each joint one q0, and one rho and delta per harmonic"
+            raise DrakeTeleopError(what, where=str(path), remedy=remedy) from None
         shapes_fit = q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
         if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):

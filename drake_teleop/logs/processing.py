@@ -360,11 +360,8 @@ def eliminate_log(
         tare=tare,
     )
     if untouched_s is not None and not tare:
-        raise DrakeTeleopError(
-            "a span without contact determines the offsets, but those of the load are requested",
-            where="untouched",
-            remedy="leave one of the two out",
-        )
+        what = "a span without contact determines the offsets, but those of the load are requested"
+        raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
@@ -408,11 +405,9 @@ def _read_and_eliminate_log(
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
-        raise DrakeTeleopError(
-            "a contact-free start requires `causal`, the mode of wrenches as in a control loop",
-            where="causal_tare_s",
-            remedy="give causal as well, or remove it",
-        )
+        what = "a contact-free start requires `causal`, the mode of wrenches as in a control loop"
+        remedy = "give causal as well, or remove it"
+        raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
     phi, point_mass = usable_phi(identification)
     phi_object = phi - phi_gripper
     known_load = phi, identification.delay_s
@@ -571,26 +566,18 @@ def _checked_scales(
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
-            raise DrakeTeleopError(
-                f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}",
-                where=name,
-                remedy="give a scale, such as 0 or 1",
-            )
+            what = f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}"
+            raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
     if sigma_object is not None and not split:
-        raise DrakeTeleopError(
-            "sigma_object requires a gripper",
-            where="sigma_object",
-            remedy="give the gripper's identification.json as well, or use sigma",
-        )
+        what = "sigma_object requires a gripper"
+        remedy = "give the gripper's identification.json as well, or use sigma"
+        raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
     if eta is None:
         kept = sigma if sigma_object is None else sigma_object
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
     if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
-        raise DrakeTeleopError(
-            "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)",
-            where="eta",
-            remedy="remove all scales except eta",
-        )
+        what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
+        raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
 
@@ -630,9 +617,7 @@ def detect_log(
     if found.log.static:
         raise _static_log_error(found.log)
     if found.detection is None:
-        raise DrakeTeleopError(
-            f"{len(found.log)} samples are too few to separate contact from noise",
-            where=found.log.source,
-            remedy=f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples",
-        )
+        what = f"{len(found.log)} samples are too few to separate contact from noise"
+        remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"
+        raise DrakeTeleopError(what, where=found.log.source, remedy=remedy)
     return DetectedLog(**vars(found.detection), eliminated=found)

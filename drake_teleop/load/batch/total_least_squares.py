@@ -58,11 +58,9 @@ def total_least_squares(
     """
     Z, Q = moments.mean_products, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
-        raise DrakeTeleopError(
-            "the wrench is 0 throughout: the mass cannot be identified",
-            where="wrench",
-            remedy="check that the sensor is connected and that its orientation changes",
-        )
+        what = "the wrench is 0 throughout: the mass cannot be identified"
+        remedy = "check that the sensor is connected and that its orientation changes"
+        raise DrakeTeleopError(what, where="wrench", remedy=remedy)
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)

@@ -52,11 +52,9 @@ def confidence_intervals(load: Identification) -> tuple[Array, Array]:
 def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> NDArray[np.bool_]:
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
-        raise DrakeTeleopError(
-            f"has shape {prior.shape}, or values that are not positive",
-            where="prior_std",
-            remedy=f"give positive numbers of shape {deviations.shape}",
-        )
+        what = f"has shape {prior.shape}, or values that are not positive"
+        remedy = f"give positive numbers of shape {deviations.shape}"
+        raise DrakeTeleopError(what, where="prior_std", remedy=remedy)
     return np.asarray(deviations >= 0.5 * prior)
 
 

@@ -202,11 +202,8 @@ class ContactDetector:
         column = statistic_index(statistic)
         enter = float(positive_array("threshold", threshold))
         if not 0.0 <= following < 1.0:
-            raise DrakeTeleopError(
-                f"{following} is outside the range 0 <= following < 1",
-                where="following",
-                remedy="give 0 to subtract no mean",
-            )
+            what = f"{following} is outside the range 0 <= following < 1"
+            raise DrakeTeleopError(what, where="following", remedy="give 0 to subtract no mean")
         decision = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
         self.settings = (floor.compiled_parameters, decision)
@@ -259,11 +256,9 @@ def fit_noise_floor(
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < 100:
-        raise DrakeTeleopError(
-            f"{len(rows[0])} samples are too few for a noise floor",
-            where="contact",
-            remedy="give 100 samples of free motion or more",
-        )
+        what = f"{len(rows[0])} samples are too few for a noise floor"
+        remedy = "give 100 samples of free motion or more"
+        raise DrakeTeleopError(what, where="contact", remedy=remedy)
     P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
     noise_std_into(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)

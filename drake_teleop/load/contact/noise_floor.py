@@ -37,11 +37,9 @@ less often than that value, which is reached about once in a record of the same 
 
 def statistic_index(statistic: str) -> int:
     if statistic not in STATISTIC_NAMES:
-        raise DrakeTeleopError(
-            f"{statistic!r} is not a statistic",
-            where="statistic",
-            remedy=f"give one of {', '.join(STATISTIC_NAMES)}",
-        )
+        what = f"{statistic!r} is not a statistic"
+        remedy = f"give one of {', '.join(STATISTIC_NAMES)}"
+        raise DrakeTeleopError(what, where="statistic", remedy=remedy)
     return STATISTIC_NAMES.index(statistic)
 
 

@@ -298,11 +298,9 @@ def change_detector_parameters(
     """
     positive_array("period", period)
     if not 0.0 <= model_error < 1.0:
-        raise DrakeTeleopError(
-            f"{model_error} is outside the range 0 <= model_error < 1",
-            where="model_error",
-            remedy="give the relative error of the model",
-        )
+        what = f"{model_error} is outside the range 0 <= model_error < 1"
+        remedy = "give the relative error of the model"
+        raise DrakeTeleopError(what, where="model_error", remedy=remedy)
     if bound is None:
         bound = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * model_error)
     positive_array("bound", bound)

@@ -114,11 +114,8 @@ class RecursiveEstimator(ABC):
         bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
-            raise DrakeTeleopError(
-                f"{forgetting} is outside the range 0 < forgetting <= 1",
-                where="forgetting",
-                remedy="give 1 for no forgetting",
-            )
+            what = f"{forgetting} is outside the range 0 < forgetting <= 1"
+            raise DrakeTeleopError(what, where="forgetting", remedy="give 1 for no forgetting")
         if not bound > 0.0:
             raise DrakeTeleopError(
                 f"{bound} is not positive", where="bound", remedy="give a number above 0"

@@ -106,11 +106,8 @@ def dataset_command(
     known = None if load is None else Identification.load(load)
     dataset, copied = open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
-        raise DrakeTeleopError(
-            "the output folder is in the dataset, which must not change",
-            where=str(out),
-            remedy="give another --out",
-        )
+        what = "the output folder is in the dataset, which must not change"
+        raise DrakeTeleopError(what, where=str(out), remedy="give another --out")
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
         streams = _described_or_drafted_streams(dataset, description)
@@ -159,11 +156,9 @@ def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: floa
         return Description.model_validate(data)
     except ValueError as error:
         first = str(error).splitlines()
-        raise DrakeTeleopError(
-            " ".join(first[1:3]).strip() or first[0],
-            where="description",
-            remedy="see docs/robot-learning.md for an example",
-        ) from error
+        what = " ".join(first[1:3]).strip() or first[0]
+        remedy = "see docs/robot-learning.md for an example"
+        raise DrakeTeleopError(what, where="description", remedy=remedy) from error
 
 
 def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:

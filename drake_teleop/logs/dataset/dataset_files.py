@@ -223,11 +223,8 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2
     if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
-        raise DrakeTeleopError(
-            "columns can only be added to a file with a header and one line for each row",
-            where=str(path),
-            remedy="convert it to Parquet",
-        )
+        what = "columns can only be added to a file with a header and one line for each row"
+        raise DrakeTeleopError(what, where=str(path), remedy="convert it to Parquet")
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
     names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])

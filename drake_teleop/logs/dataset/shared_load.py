@@ -63,11 +63,9 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
-            raise DrakeTeleopError(
-                "the fitted mass is negative in all episodes",
-                where="dataset",
-                remedy="set wrench.sign: -1 in a --description",
-            )
+            what = "the fitted mass is negative in all episodes"
+            remedy = "set wrench.sign: -1 in a --description"
+            raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
         def counted_excess(phi: Array) -> float:
             excess = _excess_log_spread(episodes, own, phi)

@@ -73,11 +73,8 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
         remedy = "turn the sensor about two axes, by more than 30 deg"
     else:
         return mounting
-    raise DrakeTeleopError(
-        f"the data do not determine the rotation of the IMU: {problem}",
-        where=where,
-        remedy=f"{remedy}, or give a rotation matrix",
-    )
+    what = f"the data do not determine the rotation of the IMU: {problem}"
+    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or give a rotation matrix")
 
 
 def _unexplained_shares_text(found: Mounting) -> str:
@@ -174,11 +171,9 @@ def estimate_auto_pose_frame(
 
 def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
     if not known.all():
-        raise DrakeTeleopError(
-            f"the data do not determine {quantity} {_unknown_axes(known)}",
-            where=where,
-            remedy="turn the sensor faster, about more axes, without contact; or give the values",
-        )
+        what = f"the data do not determine {quantity} {_unknown_axes(known)}"
+        remedy = "turn the sensor faster, about more axes, without contact; or give the values"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _unknown_axes(known: Any) -> str:
@@ -236,11 +231,9 @@ def estimate_auto_gravity(
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         deviation = direction_std_deg(estimated, covariance)
     if not deviation < _MAX_GRAVITY_DIRECTION_STD_DEG:
-        raise DrakeTeleopError(
-            "the data do not determine the direction of gravity",
-            where=f"{source}:gravity",
-            remedy="record the load in more orientations, without contact; or give the vector",
-        )
+        what = "the data do not determine the direction of gravity"
+        remedy = "record the load in more orientations, without contact; or give the vector"
+        raise DrakeTeleopError(what, where=f"{source}:gravity", remedy=remedy)
     gravity = tuple(round_for_yaml(estimated))
     note = (
         f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"

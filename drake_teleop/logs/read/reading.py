@@ -85,11 +85,9 @@ def read_log(
     """
     expect_type((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
-        raise DrakeTeleopError(
-            f"{bandwidth_hz:g} Hz is too low",
-            where="bandwidth_hz",
-            remedy=f"give at least {_MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one",
-        )
+        what = f"{bandwidth_hz:g} Hz is too low"
+        remedy = f"give at least {_MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one"
+        raise DrakeTeleopError(what, where="bandwidth_hz", remedy=remedy)
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
         reader = _LogReader(load_description(path), str(path), bandwidth_hz)
@@ -101,11 +99,8 @@ def read_log(
         return reader.read_recording(keep_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise missing_topic_error(path)
-    raise DrakeTeleopError(
-        f"format {path.suffix!r} is not known",
-        where=str(path),
-        remedy=f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)",
-    )
+    remedy = f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)"
+    raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
 
 
 def read_description(
@@ -362,11 +357,9 @@ class _LogReader:
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
         if len(t) < MIN_STREAM_SAMPLES or len(uniform_times(t)) < MIN_STREAM_SAMPLES:
-            raise DrakeTeleopError(
-                f"{len(t)} samples in {table.path.name} are too few",
-                where=f"{self._source}:{name}",
-                remedy=f"record at least {MIN_STREAM_SAMPLES}, evenly spaced",
-            )
+            what = f"{len(t)} samples in {table.path.name} are too few"
+            remedy = f"record at least {MIN_STREAM_SAMPLES}, evenly spaced"
+            raise DrakeTeleopError(what, where=f"{self._source}:{name}", remedy=remedy)
         self._notes += [f"{name}: {note}" for note in clock.notes]
         if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
             self._notes.append(
@@ -437,9 +430,6 @@ class _LogReader:
         for start, stop in np.concatenate(self._gaps):
             flags[slice(*np.searchsorted(t, [start, stop]))] = True
         if (~flags).sum() < MIN_STREAM_SAMPLES:
-            raise DrakeTeleopError(
-                f"only {int((~flags).sum())} samples are outside of gaps",
-                where=self._source,
-                remedy="record without interruptions",
-            )
+            what = f"only {int((~flags).sum())} samples are outside of gaps"
+            raise DrakeTeleopError(what, where=self._source, remedy="record without interruptions")
         return flags

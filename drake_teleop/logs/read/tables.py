@@ -81,11 +81,9 @@ class Table:
             if found <= width:
                 out[:, found - column.shape[1] : found] = column
         if found != width:
-            raise DrakeTeleopError(
-                f"lists {found} columns, but {width} are needed",
-                where=where,
-                remedy=f"list {width} columns of {self.path.name}",
-            )
+            what = f"lists {found} columns, but {width} are needed"
+            remedy = f"list {width} columns of {self.path.name}"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         return out
 
     def _check_row_counts(
@@ -152,18 +150,14 @@ class Table:
     def _finite_column(self, name: str, where: str) -> Array:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent_groups:
-                raise DrakeTeleopError(
-                    f"{self.path.name} marks {name!r} as not provided (covariance -1)",
-                    where=where,
-                    remedy="name another column, or remove this field",
-                )
+                what = f"{self.path.name} marks {name!r} as not provided (covariance -1)"
+                remedy = "name another column, or remove this field"
+                raise DrakeTeleopError(what, where=where, remedy=remedy)
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
-            raise DrakeTeleopError(
-                f"{self.path.name} has no column {name!r}",
-                where=where,
-                remedy=f"{hint} {_join_names(similar or list(self.columns))}",
-            )
+            what = f"{self.path.name} has no column {name!r}"
+            remedy = f"{hint} {_join_names(similar or list(self.columns))}"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
