@@ -87,14 +87,8 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
     assert log.posed is not None
     moved, splines = remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
-    s, omega, alpha = splines.motion(t, gravity_W)
-    moved = replace(
-        moved,
-        specific_force=s,
-        angular_velocity=omega,
-        angular_acceleration=alpha,
-        gravity=splines.gravity(t, gravity_W),
-    )
+    gravity = splines.gravity(t, gravity_W)
+    moved = moved.with_motion(*splines.motion(t, gravity_W), gravity=gravity)
     stamps, margin = splines.poses.t, _EDGE_MARGIN_OVER_KNOT_SPACING * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
@@ -175,11 +169,8 @@ def read_aligned_log(
         delay_s, source = usual_s, "load"
     log = remove_delay(log, delay_s)
     other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
-    if smooth is None or _log_residual_spread(other, phi, cutoff_hz) < _log_residual_spread(
-        smooth, phi, cutoff_hz
-    ):
-        return other
-    return smooth
+    candidates = [other] if smooth is None else [smooth, other]
+    return min(candidates, key=lambda aligned: _log_residual_spread(aligned, phi, cutoff_hz))
 
 
 def missing_orientation_error(where: str) -> DrakeTeleopError:

@@ -25,8 +25,8 @@ from drake_teleop.load.online.change import (
     update_change_detector,
 )
 from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
     SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_MOTION,
     SAMPLE_SPECIFIC_FORCE,
     SAMPLE_WRENCH,
     non_contact_wrench_into,
@@ -124,11 +124,8 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     watch = memory[_CHANGE_DETECTOR_START:]
     update_change_detector(watch, sample, block, noise, window, hold, bound)
     known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
-    s = sample[SAMPLE_SPECIFIC_FORCE]
-    omega = sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
-    non_contact_wrench_into(s, omega, alpha, known[6:], residual)
-    wrench = sample[SAMPLE_WRENCH]
+    wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
+    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest, verdict = _is_at_rest(memory, sample, period), current_change_state(watch)

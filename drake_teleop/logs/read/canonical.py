@@ -137,6 +137,10 @@ class Log:
         selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
         return replace(self, **selected)
 
+    def with_motion(self, s: Array, omega: Array, alpha: Array, **changes: Any) -> Log:
+        motion = {"specific_force": s, "angular_velocity": omega, "angular_acceleration": alpha}
+        return replace(self, **motion, **changes)
+
     @property
     def motion(self) -> tuple[Array, Array, Array]:
         return self.specific_force, self.angular_velocity, self.angular_acceleration

@@ -75,7 +75,7 @@ class Table:
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
             rows = len(column) if rows is None else rows
-            self._check_row_counts([name], [column], where, rows)
+            self._check_row_count(name, column, where, rows)
             out = out if found else np.empty((rows, width))
             found += column.shape[1]
             if found <= width:
@@ -86,21 +86,15 @@ class Table:
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         return out
 
-    def _check_row_counts(
-        self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
-    ) -> None:
-        rows = len(columns[0]) if columns and rows is None else rows
-        for name, column in zip(names, columns, strict=True):
-            if len(column) != rows:
-                raise DrakeTeleopError(
-                    f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed",
-                    where=where,
-                    remedy="name columns that belong together",
-                )
+    def _check_row_count(self, name: str | int, column: NDArray, where: str, rows: int) -> None:
+        if len(column) != rows:
+            what = f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed"
+            raise DrakeTeleopError(what, where=where, remedy="name columns that belong together")
 
     def numbers_with_nan_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
         columns = [self.numbers_with_nan(name, where) for name in names]
-        self._check_row_counts(names, columns, where, None)
+        for name, column in zip(names, columns, strict=True):
+            self._check_row_count(name, column, where, len(columns[0]))
         return np.hstack(columns)
 
     def numbers_with_nan(self, name: str | int, where: str) -> Array:
@@ -171,16 +165,11 @@ class Table:
         return numbers
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
-        return DrakeTeleopError(
-            f"{cell!r} in row {self.line_in_file(row)} is not a number",
-            where=f"{self.path}:{name}",
-            remedy="correct the cell or delete the row"
-            + (
-                ", for example a row of units, which belong into the log description"
-                if row == 0
-                else ""
-            ),
-        )
+        what = f"{cell!r} in row {self.line_in_file(row)} is not a number"
+        remedy = "correct the cell or delete the row"
+        if row == 0:
+            remedy += ", for example a row of units, which belong into the log description"
+        return DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
 
 
 def decimal_resolution(values: Array) -> float:
