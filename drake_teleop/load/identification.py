@@ -102,11 +102,8 @@ class Identification:
         "prior": the value is mostly that of the prior.
         """
         share = self.standard_deviations / natural_scales(self.phi)
-        rest = np.where(
-            self.prior_dominated,
-            "prior",
-            np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not"),
-        )
+        weakly = np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not")
+        rest = np.where(self.prior_dominated, "prior", weakly)
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:

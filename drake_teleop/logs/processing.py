@@ -384,11 +384,8 @@ def eliminate_log(
 
 
 def _static_log_error(log: Log) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        "contains only poses at rest (`static`), in which no contact can be detected",
-        where=log.source,
-        remedy="give a log of a motion",
-    )
+    what = "contains only poses at rest (`static`), in which no contact can be detected"
+    return DrakeTeleopError(what, where=log.source, remedy="give a log of a motion")
 
 
 def _read_and_eliminate_log(

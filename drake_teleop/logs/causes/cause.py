@@ -262,9 +262,5 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
 
 
 def _contact_cause(start: float, stop: float) -> Cause:
-    return Cause(
-        "contact",
-        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part is not used",
-        start_s=start,
-        stop_s=stop,
-    )
+    text = f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part is not used"
+    return Cause("contact", text, start_s=start, stop_s=stop)

@@ -328,8 +328,5 @@ def _is_load_absent(state: State, covariance: Array) -> bool:
 
 def _no_load_cause(state: State, covariance: Array) -> Cause:
     most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
-    return Cause(
-        "no load",
-        f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets",
-        values={"mass_limit": most},
-    )
+    text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
+    return Cause("no load", text, values={"mass_limit": most})

@@ -220,11 +220,11 @@ def estimate_auto_gravity(
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
-    explanation = explain_misfit(
-        block_means_of_log(log),
-        lambda delay_s: block_means_of_log(remove_delay(log, delay_s)),
-        ("gravity",),
-    )
+
+    def instants_at_delay(delay_s: float) -> Instants:
+        return block_means_of_log(remove_delay(log, delay_s))
+
+    explanation = explain_misfit(block_means_of_log(log), instants_at_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
         change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change

@@ -299,11 +299,8 @@ class _LogReader:
     def _no_orientation_error(
         self, name: str, remedy: str = "add a pose stream"
     ) -> DrakeTeleopError:
-        return DrakeTeleopError(
-            "vectors in the axes of the base cannot be rotated to S without an orientation",
-            where=f"{self._source}:{name}.frame",
-            remedy=remedy,
-        )
+        what = "vectors in the axes of the base cannot be rotated to S without an orientation"
+        return DrakeTeleopError(what, where=f"{self._source}:{name}.frame", remedy=remedy)
 
     def _read_static_poses(self, stream: Static) -> Log:
         table = self._table_of_stream(stream)
