@@ -409,7 +409,7 @@ def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_], float]:
     root, eigenvalues, null = _root_and_eigensystem(gram, ~unexcited)
-    undetermined = (np.abs(null) > _MAX_DETERMINED_NULL_COMPONENT).any(axis=1)
+    undetermined = np.asarray((np.abs(null) > _MAX_DETERMINED_NULL_COMPONENT).any(axis=1))
     return root @ root.T, undetermined, float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
 
 

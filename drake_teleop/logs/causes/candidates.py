@@ -178,21 +178,22 @@ def cable_stiffness(state: State) -> float:
 
 
 def _is_tilt_significant(state: State) -> bool:
-    true, angle = true_gravity_and_tilt(state)
-    error = abs(float(np.linalg.norm(true) / np.linalg.norm(state.data.gravity_W)) - 1.0)
+    _, angle, ratio = true_gravity_and_tilt(state)
+    error = abs(ratio - 1.0)
     # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > error
     share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
     return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
 
 
-def true_gravity_and_tilt(state: State) -> tuple[Array, float]:
-    """Return the estimated gravity (3,) [m/s^2], and its angle to the described one [deg]."""
+def true_gravity_and_tilt(state: State) -> tuple[Array, float, float]:
+    """Return the estimated gravity (3,), and its angle [deg] and ratio to the described one."""
     given = state.data.gravity_W
     assert given is not None
     true = given - state.parameters_of_extension("gravity")[0]
-    cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
-    return true, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    sizes = np.linalg.norm(true), np.linalg.norm(given)
+    angle = np.degrees(np.arccos(np.clip(true @ given / sizes[0] / sizes[1], -1.0, 1.0)))
+    return true, float(angle), float(sizes[0] / sizes[1])
 
 
 def start_parameters_of_tilt_fit(state: State) -> Array | None:

@@ -123,7 +123,7 @@ def _wrong_axes_cause(Q: Array) -> Cause:
 
 
 def _gravity_direction_cause(state: State) -> Cause:
-    true, angle = true_gravity_and_tilt(state)
+    true, angle, _ = true_gravity_and_tilt(state)
     wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
     return Cause(
         "gravity direction",

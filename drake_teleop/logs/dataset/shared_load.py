@@ -171,7 +171,8 @@ def _fit_load_to_members(
 def _contact_free_samples(
     signals: EpisodeSignals, lag: float, contact: Array, typical: Array
 ) -> DetectorSamples:
-    far = (np.abs(contact) > _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
+    limit = _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL
+    far = np.asarray((np.abs(contact) > limit).any(axis=1))
     near = widen_flags(far, _CONTACT_MARGIN_FRAMES)
     return samples_for_detector(signals, lag, contact).select_rows(~near)
 

@@ -251,8 +251,8 @@ class PoseSplines:
     def estimate_pose_noise(self) -> tuple[float, float]:
         """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""
         if self.imu_rows is not None:
-            powers = np.array(self.imu_rows.pose_noise_powers) * self.rate
-            return float(np.sqrt(powers[0])), float(np.sqrt(powers[1]))
+            stds = np.sqrt(np.array(self.imu_rows.pose_noise_powers) * self.rate)
+            return float(stds[0]), float(stds[1])
         sums, count = np.zeros(2), 0
         for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
