@@ -26,11 +26,7 @@ from drake_teleop.common.numeric import (
     positive_array,
     to_float,
 )
-from drake_teleop.load.identification import (
-    Identification,
-    is_precise_enough,
-    mark_undetermined,
-)
+from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.regressor import regressor
 
 _MAX_MOMENT_BLOCKS = 1024

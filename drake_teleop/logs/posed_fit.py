@@ -10,11 +10,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
-from drake_teleop.load.identification import (
-    Identification,
-    is_precise_enough,
-    mark_undetermined,
-)
+from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import (

@@ -17,13 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import (
-    make_folder,
-    output_folder,
-    whole_file,
-    write_json,
-    write_text,
-)
+from drake_teleop.common.files import make_folder, output_folder, whole_file, write_json, write_text
 from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress

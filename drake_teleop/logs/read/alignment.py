@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,7 +182,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         # A gap can belong to the wrench or to the motion, so both positions are flagged.
         moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
         bridged = log.bridged[known] | moved
-    advanced = {"gravity": gravity, "R_WS": R_WS, "bridged": bridged}
+    advanced: dict[str, Any] = {"gravity": gravity, "R_WS": R_WS, "bridged": bridged}
     return log.select_rows(known).with_motion(*motion, **advanced)
 
 

@@ -138,8 +138,8 @@ class Log:
         return replace(self, **selected)
 
     def with_motion(self, s: Array, omega: Array, alpha: Array, **changes: Any) -> Log:
-        motion = {"specific_force": s, "angular_velocity": omega, "angular_acceleration": alpha}
-        return replace(self, **motion, **changes)
+        changes |= {"specific_force": s, "angular_velocity": omega, "angular_acceleration": alpha}
+        return replace(self, **changes)
 
     @property
     def motion(self) -> tuple[Array, Array, Array]:
