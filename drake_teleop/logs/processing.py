@@ -26,7 +26,11 @@ from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_in
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import read_aligned_log
+from drake_teleop.logs.aligned_log import (
+    METHODS_WITH_SPLINES,
+    fit_load_to_posed_log,
+    read_aligned_log,
+)
 from drake_teleop.logs.causal import CausalWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
@@ -54,7 +58,6 @@ from drake_teleop.logs.explained_log import (
     replace_frame_causes,
     unexplained_finding,
 )
-from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_load_to_posed_log
 from drake_teleop.logs.read.alignment import (
     choose_delay,
     far_from_gaps,

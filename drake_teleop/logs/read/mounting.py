@@ -384,13 +384,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
 
 
 def _refine_rotation_and_lag(
-    t: Array,
-    drift_lag: Array,
-    t_imu: Array,
-    pairs: SignalPairs,
-    K: Array,
-    R: Array,
-    lag: float,
+    t: Array, drift_lag: Array, t_imu: Array, pairs: SignalPairs, K: Array, R: Array, lag: float
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
