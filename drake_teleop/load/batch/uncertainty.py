@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.total_least_squares import EstimatorFit, NormalForm, SampleRecord
 from drake_teleop.load.identification import (
@@ -50,12 +49,7 @@ def confidence_intervals(load: Identification) -> tuple[Array, Array]:
 
 
 def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> NDArray[np.bool_]:
-    deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
-    if deviations.shape != prior.shape or not (prior > 0.0).all():
-        what = f"has shape {prior.shape}, or values that are not positive"
-        remedy = f"give positive numbers of shape {deviations.shape}"
-        raise DrakeTeleopError(what, where="prior_std", remedy=remedy)
-    return np.asarray(deviations >= 0.5 * prior)
+    return np.asarray(np.asarray(standard_deviations) >= 0.5 * np.asarray(prior_std))
 
 
 @dataclass(frozen=True, eq=False)

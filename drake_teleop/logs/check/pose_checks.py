@@ -169,10 +169,8 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
         deviation = float(frame.rotation_stds_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
-    return Finding(
-        "pose frame",
-        f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
-    )
+    text = f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}"
+    return Finding("pose frame", text)
 
 
 def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
