@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
-from drake_teleop.common.files import output_folder, write_json, write_picture, write_table
+from drake_teleop.common.files import (
+    output_folder,
+    to_plain_values,
+    write_json,
+    write_picture,
+    write_table,
+)
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import Identification, load_of_object
@@ -24,7 +30,6 @@ from drake_teleop.logs.figures import (
     summarize_object_alone,
     summarize_record_part,
     summarize_wrenches,
-    to_plain_values,
 )
 from drake_teleop.logs.processing import (
     DetectedLog,

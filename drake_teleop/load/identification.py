@@ -136,28 +136,11 @@ class Identification:
         """Write identification.json; raise DrakeTeleopError if a number is not finite."""
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
-        covariance = self.covariance.tolist()
-        for i in np.flatnonzero(np.isinf(np.diag(self.covariance))):
-            covariance[i][i] = None
-        document = {
-            "phi": self.phi.tolist(),
-            "offsets": self.offsets.tolist(),
-            "covariance": covariance,
-            "identifiable": self.identifiable.tolist(),
-            "verdicts": list(self.verdicts),
-            **self._derived_quantities(),
-            "condition_number": self.condition_number,
-            "delay_s": self.delay_s,
-            "residual_rms": self.residual_rms.tolist(),
-            "method": self.method,
-            "samples": self.samples,
-            "weight_removed": self.weight_removed,
-            "degrees_of_freedom": [
-                float(n) if np.isfinite(n) else None for n in self.degrees_of_freedom
-            ],
-            "prior_dominated": self.prior_dominated.tolist(),
-        }
-        write_json(Path(path), document)
+        fields = list(self.__dataclass_fields__)
+        document = {name: getattr(self, name) for name in (*fields[:4], "verdicts")}
+        document |= self._derived_quantities()
+        document |= {name: getattr(self, name) for name in fields[4:]}
+        write_json(Path(path), document)  # infinity becomes null
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
@@ -220,13 +203,8 @@ class Identification:
         return result
 
     def _derived_quantities(self) -> dict[str, Any]:
-        mass, com, inertia = mass_com_inertia(self.phi)
-        return {
-            "mass": mass,
-            "com": com.tolist(),
-            "inertia_com": inertia.tolist(),
-            "physically_consistent": self.physically_consistent,
-        }
+        names = ("mass", "com", "inertia_com", "physically_consistent")
+        return {name: getattr(self, name) for name in names}
 
 
 def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:

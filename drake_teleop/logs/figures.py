@@ -179,14 +179,3 @@ def _summarize_force_and_torque(
         return dict.fromkeys(keys)
     norms = [reduce(np.linalg.norm(part, axis=1)) for part in (wrench[:, :3], wrench[:, 3:])]
     return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
-
-
-def to_plain_values(value: Any) -> Any:
-    """Convert NumPy values to plain Python values, and infinity to None."""
-    if isinstance(value, dict):
-        return {key: to_plain_values(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_plain_values(entry) for entry in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return to_plain_values(value.tolist())
-    return None if value in (float("inf"), float("-inf")) else value

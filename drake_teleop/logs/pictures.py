@@ -39,13 +39,8 @@ _PARAMETER_SYMBOLS = (
     *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
 VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
-VERDICT_WORDS = dict(
-    zip(
-        VERDICT_NAMES,
-        ("identified", "weakly identified", "not identified", "mostly the prior's"),
-        strict=True,
-    )
-)
+_VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly the prior's")
+VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED_COLOUR = "#A3AAB5"

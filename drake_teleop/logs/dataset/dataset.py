@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import make_folder, output_folder, whole_file, write_json, write_text
+from drake_teleop.common.files import (
+    make_folder,
+    output_folder,
+    to_plain_values,
+    whole_file,
+    write_json,
+    write_text,
+)
 from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress
@@ -48,7 +55,7 @@ from drake_teleop.logs.dataset.shared_load import (
     load_of_episode,
     samples_for_detector,
 )
-from drake_teleop.logs.figures import summarize_load, to_plain_values
+from drake_teleop.logs.figures import summarize_load
 from drake_teleop.logs.read.alignment import resample, widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
@@ -302,7 +309,7 @@ def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
     with whole_file(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, np.column_stack(columns))
-    write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
+    write_json(work / f"{number}.json", {"episode": episode.name} | row)
 
 
 def _read_judged_columns(path: Path) -> NewColumns:

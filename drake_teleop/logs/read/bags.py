@@ -36,16 +36,11 @@ _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_MESSAGE_FIELDS = (
-    "force",
-    "torque",
-    "linear_acceleration",
-    "angular_velocity",
-    "orientation",
-    "position",
-)
-_VECTOR_OF_MESSAGE_FIELD = {name: name for name in _VECTOR_MESSAGE_FIELDS}
-_VECTOR_OF_MESSAGE_FIELD |= {"rotation": "orientation", "translation": "position"}
+_VECTOR_OF_MESSAGE_FIELD = {
+    **{name: name for name in ("force", "torque", "linear_acceleration", "angular_velocity")},
+    **{name: "orientation" for name in ("orientation", "rotation")},
+    **{name: "position" for name in ("position", "translation")},
+}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),

@@ -151,12 +151,8 @@ def write_log(log: Log, path: str | Path) -> None:
     import polars as pl
 
     path = Path(path)
-    names = (
-        *WRENCH_COLUMNS,
-        *SPECIFIC_FORCE_COLUMNS,
-        *ANGULAR_VELOCITY_COLUMNS,
-        *ANGULAR_ACCELERATION_COLUMNS,
-    )
+    names = [*WRENCH_COLUMNS, *SPECIFIC_FORCE_COLUMNS]
+    names += [*ANGULAR_VELOCITY_COLUMNS, *ANGULAR_ACCELERATION_COLUMNS]
     values = np.hstack([log.wrench, *log.motion])
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
