@@ -107,6 +107,7 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:
+        """Return the result with all ten parameters of the load marked as not identified."""
         return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
 
     def __repr__(self) -> str:

@@ -20,7 +20,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     make_folder,
     output_folder,
-    to_plain_values,
+    to_json_data,
     whole_file,
     write_json,
     write_text,
@@ -120,7 +120,7 @@ def dataset_command(
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
-        summary = to_plain_values(_dataset_summary(dataset, copied, shared, rows))
+        summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))
         report = render_page(
             "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
         )
