@@ -1,24 +1,29 @@
 """How much energy does each method deliver to an adversary, and how fast does the hand move?
 
-`python benchmarks/adversary.py [--runs N] [--seed S] [--method M ...] [--json FILE]` lets
-`lab.comparison.one_dof` run for 12 s, N (10 000) times in all: as often with each method.
-Random are the network (loss alone and in bursts, jitter with and without reordering, outages, a
-delay that steps or swings), the hand (light to firm, a change of grip, let go), the wall (0.5 to
-50 kN/m; it stands, vanishes, jumps or swings) and the motion (slow presses, taps of 0.7 to 3 Hz,
-circles along one axis), at last a hold. Two runs of three are drawn; the others search from there,
-by changes that are kept if they make it worse, for the least energy at the slave's actual motion,
-for the largest speed of a device that was let go, and for the longest limit cycle.
+`python benchmarks/adversary.py [--runs N] [--seed S] [--method M ...] [--json FILE]` runs
+`lab.comparison.one_dof` for 12 s, N (10 000) times in all, equally often with each method. Random
+are:
 
-Energy is counted from the start energy that the method declares, at the four places that the
-module `one_dof` describes; the least at the start itself counts too, the search begins 1.5 s later.
-Speed and travel (in 2 s) are of runs that let go before a wall that stands, a limit cycle is how
-long the hand or the slave goes on to reverse, by more than 0.5 mm, when nothing else moves.
+* the network: single losses and bursts, jitter with and without reordering, outages, a delay that
+  steps or oscillates;
+* the hand: light to firm, a change of grip, letting go;
+* the wall: 0.5 to 50 kN/m; it is fixed, vanishes, jumps or oscillates;
+* the motion: slow presses, taps of 0.7 to 3 Hz, circles along one axis; at the end a hold.
 
-The same seed gives the same figures. The worst cases have names: 17 is the case drawn 17th,
-17.4.29 what the 4th and then the 29th change make of it. `--replay 17.4.29 --method M` runs it
-again and says all about it. `--known` runs a few cases of simple description instead, `--imperfect`
-has a servo and a mass that are not as the method believes, a slow motor, coarse encoders and noise.
-`--drag` lets `ledger` begin with nothing, E_0 = 0: drag on the hand has to earn its reserves.
+Two thirds of the runs are drawn. The others start from the worst of these, change them, and keep a
+change that makes the run worse: less energy at the slave's actual motion, a higher speed of a
+released device, or a longer limit cycle.
+
+Energy counts from the start energy that the method declares, at the four places of `one_dof`. The
+least energy at the very start counts too; the search begins 1.5 s later. Speed and travel (in 2 s)
+are of runs in which the hand lets go in front of a fixed wall. The length of a limit cycle is the
+time during which hand or slave reverse by more than 0.5 mm although nothing else moves.
+
+The same seed gives the same figures. Case 17 is the case drawn 17th; case 17.4.29 is case 17 after
+its 4th and 29th change. `--replay 17.4.29 --method M` prints all about one run. `--known` runs a
+few simple cases instead. With `--imperfect`, servo and mass differ from those that the method
+assumes, the motor is slow, and encoders and sensor have errors. With `--drag`, `ledger` starts
+with E_0 = 0, so that drag on the hand has to fill its reserves.
 """
 
 from __future__ import annotations
@@ -56,21 +61,21 @@ from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
 CHARGED = 1.5  # s; later, the least energy is no longer that of the start
-LEAKS = -1e-6  # J, less is more than rounding
-#: Methods that promise to create no energy at the actual motion; with a servo as believed, or not.
+LEAKS = -1e-6  # J, smaller energies are rounding
+#: Methods that promise to create no energy at the actual motion, by whether the servo is imperfect.
 PROMISED: dict[bool, set[str]] = {False: {"pspm", "ledger"}, True: {"ledger"}}
-CYCLES = 1.0  # s, longer counts in the share of runs
-SWING = 0.5e-3  # m, a reversal that counts
+CYCLES = 1.0  # s, longer cycles count in the share of runs
+SWING = 0.5e-3  # m, least reversal
 
 
 @dataclass(frozen=True)
 class Options:
-    """What holds for all runs.
+    """Options of all runs.
 
     Args:
-        seed: of the drawing.
-        imperfect: whether the station is.
-        drag: whether `ledger` begins with nothing.
+        seed: of the random cases.
+        imperfect: whether the station is imperfect.
+        drag: whether `ledger` starts without energy.
     """
 
     seed: int = 0
@@ -78,7 +83,7 @@ class Options:
     drag: bool = False
 
     def told(self, method: str) -> PassivityConfig:
-        """The method with its parameters."""
+        """Return the parameters of a method."""
         if method == "ledger" and self.drag:
             return PassivityConfig(method=method, ledger=LedgerConfig(initial=[0.0, 0.0]))
         return PassivityConfig(method=method)
@@ -86,19 +91,19 @@ class Options:
 
 @dataclass
 class Figures:
-    """Of a run, or the worst of several: least energies [J], then what is to be small."""
+    """Figures of a run, or the worst of several runs: least energies [J], then maxima."""
 
     actual: float = math.inf
     motor: float = math.inf
     command: float = math.inf
     hand: float = math.inf
     actual_later: float = math.inf  #: at the actual motion, once it is charged
-    speed: float = 0.0  #: largest, once let go [m/s]
-    travel: float = 0.0  #: in 2 s, once let go [m]
+    speed: float = 0.0  #: largest speed after letting go [m/s]
+    travel: float = 0.0  #: travel in 2 s after letting go [m]
     cycle: float = 0.0  #: longest limit cycle [s]
 
     def worse(self, other: Figures) -> Figures:
-        """The worse of both in each figure."""
+        """Return the worse value of both for each figure."""
         a, b = dataclasses.astuple(self), dataclasses.astuple(other)
         worst = [(min if i < 5 else max)(pair) for i, pair in enumerate(zip(a, b, strict=True))]
         return Figures(*worst)
@@ -109,11 +114,11 @@ AIMS: dict[str, Callable[[Figures], float]] = {
     "speed": lambda found: found.speed,
     "cycle": lambda found: found.cycle,
 }
-"""What the search makes as large as it can."""
+"""Quantities that the search maximises."""
 
 
 def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
-    """The figures of a run."""
+    """Return the figures of a run."""
     charged = round(CHARGED / PERIOD)
     later = (run.accounts[:, HAND] + run.accounts[:, ACTUAL])[charged:]
     found = Figures(
@@ -127,17 +132,21 @@ def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
         return found
     over = round(let_go_at(case) / PERIOD)
     if case["end"] == "lets go":
-        free = run.master[over - 1 : over + 2000]
+        free = run.master_position[over - 1 : over + 2000]
         found.speed = float(np.nanmax(np.abs(np.diff(free)), initial=0.0)) / PERIOD
         found.travel = float(np.nanmax(np.abs(free - free[0]), initial=0.0))
     begin = round((case["until"] + 0.8) / PERIOD)
     still = slice(begin, None if case["end"] == "holds on" else over, 10)
-    found.cycle = max(_cycling(x[still].tolist()) for x in (run.master, run.slave)) * 10 * PERIOD
+    found.cycle = (
+        max(_cycling(x[still].tolist()) for x in (run.master_position, run.slave_position))
+        * 10
+        * PERIOD
+    )
     return found
 
 
 def _cycling(x: list[float]) -> int:
-    """Samples until the last reversal by more than `SWING`; 0 for less than two cycles."""
+    """Return the samples until the last reversal by more than `SWING`; 0 below two cycles."""
     last, way, extreme, turns = 0, 0, x[0], 0
     for k, value in enumerate(x):
         if way == 0:
@@ -151,14 +160,14 @@ def _cycling(x: list[float]) -> int:
 
 
 def run_case(method: str, path: tuple[int, ...], options: Options) -> Figures:
-    """The figures of one case."""
+    """Return the figures of one case."""
     case = case_of(path, options.seed)
     run = run_one_dof(passivity=options.told(method), **prepared(case, options.imperfect))
     return measured(run, case)
 
 
 def _drawn(job: tuple[tuple[str, ...], range, Options]) -> list[list[Figures]]:
-    """For each case drawn, the figures of all methods."""
+    """Return the figures of all methods for each drawn case."""
     names, cases, options = job
     found = []
     for index in cases:
@@ -170,11 +179,11 @@ def _drawn(job: tuple[tuple[str, ...], range, Options]) -> list[list[Figures]]:
 
 
 Seen = dict[str, tuple[float, tuple[int, ...]]]
-"""Aim -> the worst value seen, and in which case."""
+"""Aim -> the worst value, and its case."""
 
 
 def _searched(job: tuple[str, str, int, int, Options]) -> tuple[str, Figures, Seen]:
-    """Climbs from a case drawn towards an aim: the method, and the worst of all runs on the way."""
+    """Search from a drawn case towards an aim; return the method and the worst of all its runs."""
     method, aim, index, trials, options = job
     best: tuple[int, ...] = (index,)
     worst = run_case(method, best, options)
@@ -192,7 +201,7 @@ def _searched(job: tuple[str, str, int, int, Options]) -> tuple[str, Figures, Se
 def study(
     names: tuple[str, ...], runs: int, options: Options, starts: int = 3, processes: int = 2
 ) -> dict[str, dict[str, Any]]:
-    """Method -> its figures: after drawing, after the search, and the names of the worst cases."""
+    """Return by method its figures after drawing and after the search, and its worst cases."""
     each = max(runs // len(names), 4)
     trials = max(each // (3 * len(AIMS) * starts), 1)
     drawn = max(each - trials * len(AIMS) * starts, starts)
@@ -231,7 +240,7 @@ def study(
 
 
 def print_study(result: dict[str, dict[str, Any]]) -> None:
-    """The table, and the names of the worst cases."""
+    """Print the table and the names of the worst cases."""
     print("Least energy [J] between the hand and ...: drawn / searched. Let go: drawn / searched.")
     ports = ("actual", "motor", "command", "hand")
     heads = ("the actual motion", "the motor", "the command", "the hand alone")
@@ -251,7 +260,7 @@ def print_study(result: dict[str, dict[str, Any]]) -> None:
 
 
 def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
-    """Case of simple description -> method -> its figures, as `print_known` says."""
+    """Return the figures of the simple cases by case and method; see `print_known`."""
     medium = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
     begun = np.clip(TIME / 0.5, 0.0, 1.0)
     taps = begun * 0.05 * np.sin(4 * np.pi * TIME) + FREE * (1 - begun)
@@ -278,7 +287,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     for name in names:
         one = PassivityConfig(method=name)
         let_go = run_one_dof(REFERENCE, one, steady, intent=push, grip=hand)
-        free = let_go.master[8999:11000]
+        free = let_go.master_position[8999:11000]
         rows = {
             "taps": [least(one, REFERENCE, steady, intent=tap)],
             "taps, bursts": [least(one, medium, bursts, seed=n, intent=tap) for n in range(10)],
@@ -286,7 +295,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
                 least(one, medium, steady, delays=outages(n), timeout=0.1) for n in range(20)
             ],
             "let go": [
-                abs(float(let_go.felt[8999])),
+                abs(float(let_go.hand_force[8999])),
                 float(np.abs(np.diff(free)).max()) / PERIOD,
                 float(np.abs(free - free[0]).max()),
             ],
@@ -297,7 +306,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
 
 
 def print_known(found: dict[str, dict[str, list[float]]]) -> None:
-    """A line for each method."""
+    """Print a line for each method."""
     print("Round trip 100 ms. Taps of 50 mm at 2 Hz, the same by a medium grip with 30 % lost in")
     print("bursts of 80 ms (10 seeds), its usual press with outages of 0.4 s (20 seeds): least")
     print("energy at the actual motion [J], and in how many runs it is negative. Let go at 4 N.")
@@ -312,16 +321,22 @@ def print_known(found: dict[str, dict[str, list[float]]]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs what is asked for and prints it; returns 1 if a method of `PROMISED` leaks, else 0."""
+    """Run and print the study; return 1 if a method of `PROMISED` creates energy, else 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=10_000, help="of all methods together")
-    parser.add_argument("--seed", type=int, default=0, help="of the drawing")
+    parser.add_argument(
+        "--runs", type=int, default=10_000, help="runs of all methods together (default: 10000)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random cases (default: 0)")
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--imperfect", action="store_true", help="servo, motor and sensors")
-    parser.add_argument("--drag", action="store_true", help="ledger begins with nothing")
-    parser.add_argument("--known", action="store_true", help="cases of simple description instead")
-    parser.add_argument("--replay", metavar="CASE", help="one case by its name, such as 17.4.29")
-    parser.add_argument("--json", metavar="FILE", help="writes the figures there")
+    parser.add_argument(
+        "--imperfect", action="store_true", help="make servo, motor and sensors imperfect"
+    )
+    parser.add_argument("--drag", action="store_true", help="let ledger start without energy")
+    parser.add_argument("--known", action="store_true", help="run the simple cases instead")
+    parser.add_argument(
+        "--replay", metavar="CASE", help="run one case by its name, such as 17.4.29"
+    )
+    parser.add_argument("--json", metavar="FILE", help="file for the figures")
     asked = parser.parse_args(arguments)
     names, options = tuple(asked.method), Options(asked.seed, asked.imperfect, asked.drag)
     figures: dict[str, Any]

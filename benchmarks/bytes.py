@@ -1,12 +1,12 @@
 """Do the commands write the same bytes, whatever the environment?
 
-`python benchmarks/bytes.py [--all] [--json FILE]` has drake-teleop run, reproduce, sample-log,
-identify, eliminate, detect, inspect, study, excite and analyze write into new folders, under
-combinations of BLAS threads, hash seeds, time zones, folders and locales: so many that each two
-values of different kinds meet. With --all every combination is tried, without analyze and with
-shorter runs (`SHORTER`). Compared are the files of each but `session.json`, by their SHA-256, with
-those of the first combination. The baseline is that one once more: what differs there has other
-causes. Each combination identifies its loads anew.
+`python benchmarks/bytes.py [--all] [--json FILE]` executes drake-teleop run, reproduce, sample-log,
+identify, eliminate, detect, inspect, study, excite and analyze with new output folders. The
+combinations of BLAS threads, hash seeds, time zones, folders and locales contain every pair of
+values. With --all every combination is tried, without analyze and with shorter runs (`SHORTER`).
+The SHA-256 of all files except `session.json` are compared with those of the first combination.
+The baseline repeats the first combination: differences there have other causes. Each combination
+identifies its loads anew.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SURROUNDINGS = {
     "locale": ("C.UTF-8", "POSIX"),
 }
 Combination: TypeAlias = tuple[str, ...]
-"""One value of each of the surroundings, in their order."""
+"""One value of each part of the environment, in the order of `SURROUNDINGS`."""
 Command: TypeAlias = Sequence[str]
 
 FILES = {
@@ -79,7 +79,7 @@ SHORTER: dict[str, Command] = {
     "study": ("study", "short_study.yaml", "--jobs", "2"),
     "excite": ("excite", "--period", "1", "--harmonics", "2"),
 }
-"""Of `COMMANDS`, for every combination."""
+"""Changes of `COMMANDS` for every combination."""
 IN_ONE_PROCESS = """
 import json, sys
 from drake_teleop.cli.main import main
@@ -94,12 +94,12 @@ for words in json.loads(sys.argv[1]):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--all", action="store_true", help="every combination")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--all", action="store_true", help="try every combination")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     everything = list(itertools.product(*SURROUNDINGS.values()))
     combinations, commands = pairwise(everything), COMMANDS
-    if arguments.all:  # the most different first, because the others take long
+    if arguments.all:  # the most different combination first, because the others take long
         combinations += [each for each in everything if each not in combinations]
         commands = SHORTER
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +111,7 @@ def main() -> None:
 
 
 def pairwise(everything: Sequence[Combination]) -> list[Combination]:
-    """Combinations in which each two values of different surroundings are together once."""
+    """Return combinations that contain each pair of values of different parts."""
     left = set().union(*map(pairs, everything))
     chosen: list[Combination] = []
     while left:
@@ -121,14 +121,14 @@ def pairwise(everything: Sequence[Combination]) -> list[Combination]:
 
 
 def pairs(combination: Combination) -> set[object]:
-    """Each two values of a combination, with their places."""
+    """Return all pairs of values of a combination, with their positions."""
     return set(itertools.combinations(enumerate(combination), 2))
 
 
 def compared(
     combinations: Sequence[Combination], commands: dict[str, Command], folder: Path
 ) -> dict[str, object]:
-    """How many files were written, and of each command those that were not always the same."""
+    """Return the number of files, and for each command those that were not always the same."""
     reference: dict[str, str] = {}
     differ: dict[str, set[str]] = {name: set() for name in commands}
     start = time.monotonic()
@@ -154,7 +154,7 @@ def written(
     folder: Path,
     program: str = IN_ONE_PROCESS,
 ) -> dict[str, str]:
-    """`digests` of what the commands write in a process with these surroundings."""
+    """Return the `digests` of the commands' output in a process with this environment."""
     threads, hash_seed, time_zone, name, locale = combination
     place = folder / name
     place.mkdir(parents=True)
@@ -179,12 +179,12 @@ def written(
 
 
 def typed(commands: dict[str, Command]) -> list[list[str]]:
-    """The words of each command, with a folder for what it writes."""
+    """Return the words of each command, with its output folder."""
     return [[*words, "--out", f"out/{name}", "--quiet"] for name, words in commands.items()]
 
 
 def digests(out: Path) -> dict[str, str]:
-    """SHA-256 of each file in a folder, by its name, but for those of a session."""
+    """Return the SHA-256 of each file in a folder by its name, except those of a session."""
     return {
         file.relative_to(out).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in out.rglob("*")

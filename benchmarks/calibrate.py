@@ -1,19 +1,21 @@
 """Does `calibrate` stop in time, and is the load that it calls identified correct?
 
-`python benchmarks/calibrate.py [--json FILE] [--loads 100]` lets it calibrate simulated loads (0.8
-to 6 kg, radii of gyration of 4 to 9 cm) in virtual time, at 500 Hz, until "mass 0.5 %, com 0.5 mm"
-is known from a hand's motion, and until "inertia 5 %" is known, too, from that of `excite` for the
-shipped station; and the former from noisy poses of a hand (`posed_hand.py`):
+`python benchmarks/calibrate.py [--json FILE] [--loads 100]` calibrates simulated loads (0.8 to 6
+kg,
+radii of gyration of 4 to 9 cm) in virtual time at 500 Hz. Three cases: "mass 0.5 %, com 0.5 mm"
+from
+a hand's motion; also "inertia 5 %" from the motion of `excite` for the shipped station; the former
+from noisy poses of a hand (`posed_hand.py`).
 
 * hand: rotations and accelerations of sines from 0.2 to 1.5 Hz with a rms of 1 to 3 rad/s, another
-  for each load, which begin with half a second of rest;
+  motion for each load, after half a second of rest;
 * noise of the wrench 0.25 N and 0.012 N m per sample at 1 kHz, white, AR(1) 0.5 or 0.9; of the
   motion 0.05 m/s^2, 0.002 rad/s, 0.2 rad/s^2, white; motion late by 0 to 8 ms; offsets.
 
-Counted: numbers that were called known and are wrong by more than their tolerance; how often the
-stated 95 % intervals hold at the moment when it stops; seconds until then. Baseline: stopping at
-the first look whose 95 % intervals are inside the tolerances. Gains of the sensor are right: no
-interval here knows of wrong ones.
+Figures: numbers that are called known but are wrong by more than their tolerance; how often the
+stated 95 % intervals contain the truth when it stops; seconds until then. Baseline: stopping at
+the first check at which all 95 % intervals are inside the tolerances. The gains of the sensor are
+correct, because no interval here includes gain errors.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ Motion = tuple[Array, Array, Array]
 
 
 def load_of(rng: np.random.Generator) -> Array:
-    """(10,) phi of some tool."""
+    """Return phi (10,) of a random tool."""
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     m, radii = rng.uniform(0.8, 6.0), rng.uniform(0.04, 0.09, 3)
     squares = m * radii**2
@@ -61,7 +63,7 @@ def load_of(rng: np.random.Generator) -> Array:
 
 
 def hand(rng: np.random.Generator, t: Array) -> Motion:
-    """A hand that turns and shifts the tool, from rest."""
+    """Return the motion of a hand that rotates and moves the tool, from rest."""
     rates = rng.uniform(0.2, 1.5, (6, 5)) * 2.0 * np.pi
     phases = rng.uniform(0.0, 2.0 * np.pi, (6, 5))
     waves = np.sin(t[:, None, None] * rates + phases).sum(axis=2) / np.sqrt(2.5)
@@ -74,7 +76,7 @@ def hand(rng: np.random.Generator, t: Array) -> Motion:
 
 
 def turned(omega: Array, dt: float) -> Array:
-    """(N, 3) the vertical in S, which is z at first."""
+    """Return the vertical (N, 3) in S, which is z at first."""
     up = np.empty_like(omega)
     up[0] = [0.0, 0.0, 1.0]
     for k in range(1, len(omega)):  # gravity in S turns by -omega
@@ -89,7 +91,7 @@ def turned(omega: Array, dt: float) -> Array:
 
 
 def excited(t: Array) -> Motion:
-    """The motion of `excite` for the station's slave, period after period."""
+    """Return the motion of `excite` for the station's slave, period after period."""
     from drake_teleop.lab.excitation.excite import excite, sensor_motion
     from drake_teleop.lab.excitation.robot import RobotFromScenario
     from drake_teleop.station.scenario import LoadScenario
@@ -105,7 +107,7 @@ def excited(t: Array) -> Motion:
 
 
 class Stream:
-    """Readings as fast as they are taken."""
+    """Source that delivers readings without waiting."""
 
     live = False
 
@@ -115,7 +117,7 @@ class Stream:
 
     @property
     def recorded(self) -> tuple[Array, Array]:
-        """(N,) times and (N, 15) values of all readings."""
+        """Return times (N,) and values (N, 15) of all readings."""
         return self._t, self._values
 
     def read(self, timeout_s: float) -> list[Reading] | None:
@@ -132,7 +134,7 @@ class Stream:
 def stream_of(
     rng: np.random.Generator, phi: Array, t: Array, motion: Motion, late: int | None = None
 ) -> Stream:
-    """What sensors say of it; the motion is `late` samples late, or 0 to 4."""
+    """Return the sensors' readings; the motion is `late` samples late, or 0 to 4."""
     a = rng.choice(COLOURS)
     white = rng.normal(size=(len(t) + 500, 6)) * np.sqrt(1.0 - a * a)
     noise = lfilter([1.0], [1.0, -a], white, axis=0)[500:] * NOISE
@@ -147,7 +149,7 @@ def stream_of(
 
 
 def judged(at: RecordEvaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
-    """Errors over tolerances, and which intervals hold, at a look."""
+    """Return errors over tolerances, and which intervals contain the truth, at one check."""
     assert at.identified_log is not None
     found = at.identified_log.identification.phi
     error = np.abs(
@@ -161,7 +163,7 @@ def judged(at: RecordEvaluation, tolerance: Tolerance, phi: Array) -> dict[str, 
 
 
 def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
-    """Figures of one motion."""
+    """Return the figures of one motion."""
     tolerance, t = parse_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
     motion = excited(t) if name == "excite" else None
     stops: list[dict[str, Any]] = []
@@ -209,9 +211,9 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--loads", type=int, default=100, help="for each motion")
-    parser.add_argument("--only", choices=["hand", "excite", "poses"], help="one motion alone")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--loads", type=int, default=100, help="loads for each motion")
+    parser.add_argument("--only", choices=["hand", "excite", "poses"], help="only this motion")
     options = parser.parse_args()
     figures = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,11 @@
-"""Is each call of the library fast enough for the station or for the person who waits?
+"""Is each call of the library fast enough for the station or for the waiting user?
 
     python benchmarks/calls.py [--json FILE]
 
-The status is 1 if a call takes longer than it may. Baselines: the same function interpreted, for
-what runs at every sample; one cell at a time, for grids; a second of simulation, for the
-linearisation. Times are thread CPU time, the shortest of some rounds.
+The exit status is 1 if a call exceeds its limit. Baselines: the same function interpreted, for
+calls
+at every sample; one cell at a time, for grids; a second of simulation, for the linearisation. Times
+are thread CPU time, the shortest of some rounds.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ from drake_teleop.station.sensor.sensor_chain import (
 from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.station import MakeTeleopStation
 
-PERIOD = 1 / 8000  # [s] of the sensor
+PERIOD = 1 / 8000  # [s], period of the sensor
 N = 100  # cells of a grid in each direction
-SAMPLE = 40  # cells of a grid that the baseline does
-#: What each call may take [s].
+SAMPLE = 40  # cells of a grid for the baseline
+#: Time limit of each call [s].
 MAY_TAKE = {
     **{f"reading of {name}": 2.5e-6 for name in PRESETS},
     "detection of contact, a sample": 5e-6,
@@ -54,7 +55,7 @@ MAY_TAKE = {
 
 
 def seconds(call: Callable[[], Any], rounds: int) -> float:
-    """Of the thread, the shortest of some rounds, after one that compiles."""
+    """Return the shortest of some thread times [s], after a round that compiles."""
     times = []
     for _ in range(rounds + 1):
         began = time.thread_time()
@@ -70,7 +71,7 @@ def _read_often(constants, memory, noise, truth, reading, count):  # type: ignor
 
 
 def reading(config: WristSensorConfig) -> tuple[float, float]:
-    """One sample of six joints through the chain, and the same interpreted [s]."""
+    """Return the time of one sample of six joints through the sensor chain, and interpreted [s]."""
     rng = np.random.default_rng(0)
     constants, memory = initialize_sensor_chain(config, 6, PERIOD)
     noise = rng.standard_normal(NOISE_BLOCK_SIZE)
@@ -86,7 +87,7 @@ def _detect_often(memory, wrenches, motion, parameters):  # type: ignore[no-unty
 
 
 def detection() -> tuple[float, float]:
-    """All statistics of one sample at rest, and the same interpreted [s]."""
+    """Return the time of all statistics of one sample at rest, and interpreted [s]."""
     noise = np.repeat([0.05, 0.002], 3)
     still = np.zeros(3)
     floor = NoiseFloor(noise, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.full(6, 0.5))
@@ -100,7 +101,7 @@ def detection() -> tuple[float, float]:
 
 
 def margin_grid() -> tuple[float, float]:
-    """Margins and unstable multipliers over delay and stiffness, and cell by cell [s]."""
+    """Return the time of margins and unstable multipliers over a grid, and cell by cell [s]."""
 
     def margins(delay: Any, stiffness: Any) -> None:
         loop = cut_loop(OneAxis(wall_stiffness=stiffness), Sampling())
@@ -111,7 +112,7 @@ def margin_grid() -> tuple[float, float]:
 
 
 def wall_grid() -> tuple[float, float]:
-    """Passive and stable stiffness over the device's and the wall's damping, cell by cell [s]."""
+    """Return the time of passive and stable stiffness over a grid, and cell by cell [s]."""
 
     def limits(b: Any, B: Any) -> None:
         passive_stiffness(b, B, 1e-3)
@@ -121,7 +122,7 @@ def wall_grid() -> tuple[float, float]:
 
 
 def grid(call: Callable[[Any, Any], None], a: Any, b: Any) -> tuple[float, float]:
-    """The call on the whole grid, and on each of its cells as by a sample of them [s]."""
+    """Return the time of the call on the whole grid, and cell by cell from a sample [s]."""
     cells = np.random.default_rng(1).integers(N, size=(SAMPLE, 2))
 
     def some() -> None:
@@ -132,7 +133,7 @@ def grid(call: Callable[[Any, Any], None], a: Any, b: Any) -> tuple[float, float
 
 
 def linearisation() -> tuple[float, float]:
-    """Of the station with 40 mm of a leaf pressed in, and a second of its simulation [s]."""
+    """Return the time of linearising a station in contact, and of one simulated second [s]."""
     leaf = SheetSpring(
         position=[0.55, 0.0, 0.45 - 0.2 - 0.03], length=0.12, width=0.05, thickness=0.0015
     )
@@ -150,7 +151,7 @@ def linearisation() -> tuple[float, float]:
 
 
 def measure() -> dict[str, dict[str, float]]:
-    """Per call, what it takes, what it may take, and what the baseline takes [s]."""
+    """Return time, limit and time of the baseline for each call [s]."""
     calls: list[Callable[[], tuple[float, float]]] = [
         *(lambda name=name: reading(PRESETS[name]) for name in PRESETS),  # type: ignore[misc]
         detection,
@@ -166,9 +167,9 @@ def measure() -> dict[str, dict[str, float]]:
 
 
 def main() -> int:
-    """Measures, prints; returns 0 if no call takes longer than it may."""
+    """Measure and print; return 0 if no call exceeds its limit."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     rows = measure()
     print(f"{'':52}{'takes':>10}{'may take':>10}{'baseline':>12}")

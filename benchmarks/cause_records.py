@@ -1,8 +1,8 @@
 """Records of a wrist sensor whose wrench contains planted causes of misfit, with the truth.
 
 A load of 0.25 to 8 kg moves along a path of `known_paths`. `make_record` draws a record, `write`
-writes its files with a description. Nothing comes from the package, so that an error of its signs
-shows.
+writes its files with a description. The records do not use the package, so that errors of its signs
+are found.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from scipy.spatial.transform import Rotation
 
 GRAVITY = 9.80665
 SENSORS = ("poses", "imu")
-_RAMP_S = 0.25  # that a load takes from the table to the gripper, if it does not step
-# Torque in N m over what was written, if a unit or the sign is mistaken.
+_RAMP_S = 0.25  # time in which a load goes from the table to the gripper, if it does not step
+# Torque in N m over the written value, for a mistaken unit or sign.
 _FACTORS = (-1.0, 10.0, 0.1, 8.8507, 1 / 8.8507, 1e3, 1e-3, 100.0, 9.80665, 1.3558, -10.0)
 
 
@@ -69,7 +69,7 @@ class Draft:
     load: Load
     wrench: Array
     truth: Truth
-    # Of the poses, in S.
+    # of the poses, in S
     frame: Array = field(default_factory=lambda: np.zeros(3))
     turn: Rotation = field(default_factory=Rotation.identity)
 
@@ -154,7 +154,7 @@ def plant_factor(d: Draft) -> None:
 
 
 def _a_time(d: Draft) -> float:
-    """Draw a time away from the ends, and 3 s from all other causes if there is room."""
+    """Draw a time away from the ends, and 3 s from all other causes if possible."""
     taken = [span for spans in d.truth.times.values() for span in spans]
 
     def room(time: float) -> float:
@@ -381,7 +381,7 @@ def _noise(d: Draft, colours: list[float]) -> Array:
 
 
 def _stamps(d: Draft, rates: tuple[float, ...], late: float) -> tuple[Array, Array]:
-    """Draw the rows of a stream; return when they were taken, and their later stamps."""
+    """Draw the rows of a stream; return their true times, and their later stamps."""
     stamps = np.arange(d.rng.uniform(0.0, 0.002), d.span, 1 / d.rng.choice(rates))
     return stamps - late, stamps
 

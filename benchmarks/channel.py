@@ -1,7 +1,7 @@
 """How much does a passivity method cost in the station, over the same network without one?
 
-Free motion over `internet`, so that all take the same steps (in contact, the methods bounce
-differently); all stations interleaved in this process, thread CPU time.
+The stations are in free motion over `internet`, so that all take the same steps (in contact, the
+methods bounce differently). They run interleaved in this process; times are thread CPU time.
 
     python benchmarks/channel.py [--json FILE]
 """
@@ -20,7 +20,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     direct = LoadScenario("free_motion_force")
     stations = {"direct": MakeMovingStation(direct)}

@@ -2,13 +2,13 @@
 
 `python benchmarks/compensate.py [--json FILE] [--seconds 10]` prints for 1 and 8 kHz:
 
-* processing: from the packet in hand to the wrench sent, by the clock: median, 99 %, largest;
-* way: from the sender's clock to the same moment, likewise;
-* core: the CPU time of the loop over the time that passed; good: the share of the packets that came
-  in time and were compensated. The rest was lost, or late and therefore zero.
+* processing: time from the received packet to the sent wrench, by the clock: median, 99 %, largest;
+* way: time from the sender's stamp to the sent wrench, likewise;
+* core: CPU time of the loop over elapsed time; good: share of the packets that arrived in time and
+  were compensated. The others were lost, or were late and therefore zero.
 
-Baseline: the same loop with the same packets, which sends them on as they are. It wants an
-otherwise idle machine: the tails are the operating system's.
+Baseline: the same loop, which forwards the same packets. The machine must be otherwise idle: the
+largest times are those of the operating system.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RATES = (1000.0, 8000.0)
 
 
 def send(port: int, rate: float, seconds: float) -> None:
-    """Readings of a load in motion, stamped when they are sent, on a grid of times."""
+    """Send readings of a moving load, stamped when they are sent, at regular times."""
     t = np.arange(round(rate * seconds)) / rate
     omega = np.column_stack([np.sin(5 * t + k) for k in range(3)])
     alpha = np.column_stack([5 * np.cos(5 * t + k) for k in range(3)])
@@ -55,7 +55,7 @@ def send(port: int, rate: float, seconds: float) -> None:
 
 
 class Timed:
-    """A source and a sink that look at the clock; it is over with the first packet that is none."""
+    """Source and sink that record times; the first packet without a reading ends the run."""
 
     live = True
 
@@ -89,10 +89,10 @@ class Timed:
 
 
 class Passed(Compensator):
-    """The baseline: what comes in goes out."""
+    """Baseline: forwards its input."""
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:
-        """Nothing but the copy."""
+        """Return a copy."""
         self._now = now
         return CompensatedWrench(
             reading.number, reading.t, reading.values[:6], reading.values[:6], 0
@@ -100,7 +100,7 @@ class Passed(Compensator):
 
 
 def measured(rate: float, seconds: float, kind: type[Compensator]) -> dict[str, Any]:
-    """Figures of a stream."""
+    """Return the figures of a stream."""
     load = Identification(
         *(PHI, np.zeros(6), 1e-6 * np.eye(16), np.ones(16, bool), 4.0, 0.0, np.full(6, 0.01)),
         *("batch least squares", 100),
@@ -130,8 +130,10 @@ def measured(rate: float, seconds: float, kind: type[Compensator]) -> dict[str, 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each stream")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="duration of each stream [s] (default: 10)"
+    )
     options = parser.parse_args()
     figures: dict[str, float] = {}
     for rate in RATES:

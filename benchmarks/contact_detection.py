@@ -2,25 +2,25 @@
 
 `python benchmarks/contact_detection.py [--json FILE] [--hours 1]` moves a load of 3.1 kg fast and
 touches it 500 times with 0.05 to 5 N in any direction, 0.3 s each. The wrench has white noise
-(0.08 N, 3 mN m) and gains that are off by 0.3 %; the motion has noise of its own and comes 1 ms
-late, uncorrected. Load and offsets are identified from another such motion by the same sensors, and
-the noise floors are fitted to a third. The thresholds are those at which 1 % of the windows of 0.3
-s have a false alarm in the same motion without contacts, so that all are compared at one rate; how
-many have one in a fourth motion says whether a threshold can be carried over.
+(0.08 N, 3 mN m) and gain errors of 0.3 %; the motion has noise and an uncorrected delay of 1 ms.
+Load and offsets are identified from a second motion with the same sensors; the noise floors are
+fitted to a third. At the chosen thresholds, 1 % of the windows of 0.3 s have a false alarm in the
+same motion without contacts, so that all detectors are compared at one rate. The rate in a fourth
+motion shows whether a threshold is transferable.
 
-The table has, for the measured wrench (tared), for that without the static weight (of the same
-identification) and for the eliminated one: the AUC of a window's largest statistic, the share of
-contacts noticed, and the median delay of those; contacts that are missed count as later than any.
-Baselines are the raw wrench, and for the floor that rises with the motion one that does not.
-The time is of a sample, all three statistics at once.
+The table has three wrenches: measured (tared), without the static weight (same identification), and
+eliminated. Its figures are the AUC of a window's largest statistic, the share of detected contacts,
+and their median delay; missed contacts count as the latest. Baselines are the raw wrench, and for
+the noise floor that rises with the motion, a constant one. The time is that of one sample with all
+three statistics.
 
-Then the eliminated wrench alone, and delay at equal false alarms per time: the thresholds are those
-that each statistic reaches in one second of 600, of `--hours` of free motion. A contact lasts 1 s;
-it rises within 5 ms (hard) or 100 ms (soft). The delay is the mean, with 1 s for a contact that is
-missed; the difference to the plain threshold is paired, with its standard error. Twice: with gains
-and delay that are right, so that what is left is white, as in the station
-(benchmarks/contact_in_station.py); and with those that are wrong. 300 contacts of each size, and
-the cumulative sum with a slack that suits the small contacts and one that suits the large ones.
+The second part compares delays of the eliminated wrench at equal false alarms per time: each
+statistic has the threshold that it reaches in one second of 600, in `--hours` of free motion. A
+contact lasts 1 s and rises within 5 ms (hard) or 100 ms (soft). The delay is the mean, with 1 s for
+a missed contact; its difference to the plain threshold is paired and has a standard error. There
+are two cases: with correct gains and delay, so that the residual is white as in the station
+(benchmarks/contact_in_station.py), and with the errors above. Each size has 300 contacts; the
+cumulative sum has a slack for small contacts and one for large contacts.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def auc(free: Array, touched: Array) -> float:
 
 
 def motion(samples: int, rng: np.random.Generator) -> tuple[Array, ...]:
-    """(s, omega, alpha, gravity in S): three slow swings and three shakes, faster and slower."""
+    """Return (s, omega, alpha, gravity in S): slow swings and shakes at varying speed."""
     t = DT * np.arange(samples)
 
     def sines(low: float, high: float, size: float) -> Array:
@@ -93,7 +93,7 @@ def motion(samples: int, rng: np.random.Generator) -> tuple[Array, ...]:
 
 
 class Record:
-    """What the sensors say of one motion, with the tool pushed by (N, 3) forces at its tip."""
+    """Readings of the sensors along one motion; forces (N, 3) push the tool at its tip."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class Record:
         self.gravity = gravity
 
     def rows(self, kind: str, phi: Array, offsets: Array) -> tuple[Array, ...]:
-        """(wrench of this kind, s, omega, alpha, a)."""
+        """Return (wrench of this kind, s, omega, alpha, a)."""
         rest = np.zeros_like(self.gravity)
         if kind == "raw":
             wrench = self.wrench - offsets
@@ -128,7 +128,7 @@ class Record:
 
 
 def windows(floor: NoiseFloor, rows: tuple[Array, ...]) -> Array:
-    """(K, WINDOW, 3) statistics at the end of each stretch, the sums starting with the stretch."""
+    """Return statistics (K, WINDOW, 3) up to each sample of a window; sums start with it."""
     length = WARM + WINDOW
     return np.stack(
         [
@@ -139,7 +139,7 @@ def windows(floor: NoiseFloor, rows: tuple[Array, ...]) -> Array:
 
 
 def forces(rng: np.random.Generator) -> tuple[Array, Array]:
-    """(CONTACTS,) sizes and (N, 3) pushes; each rises within 5 ms."""
+    """Return sizes (CONTACTS,) and pushes (N, 3); each rises within 5 ms."""
     sizes = np.geomspace(FORCES[0], FORCES[-1], CONTACTS)
     rng.shuffle(sizes)
     directions = rng.normal(size=(CONTACTS, 3))
@@ -165,7 +165,7 @@ def measure() -> dict[str, Any]:
     for kind, fixed in (("raw", 0), ("gravity only", 0), ("eliminated", 1), ("eliminated", 0)):
         calm, elsewhere, untouched, touched = (r.rows(kind, phi, result.offsets) for r in records)
         if kind == "raw":
-            # Tared where it is: the mean weight is part of the offsets.
+            # Tare within the motion: the mean weight is part of the offsets.
             mean = calm[0].mean(axis=0)
             calm, elsewhere, untouched, touched = (
                 (rows[0] - mean, *rows[1:]) for rows in (calm, elsewhere, untouched, touched)
@@ -209,13 +209,13 @@ CHUNK, SECOND, EACH, BEFORE = 300_000, 1000, 300, 500
 
 
 def compared(floor: NoiseFloor, rows: tuple[Array, ...]) -> Array:
-    """(N, 4) level, glr, and the cumulative sum with each slack."""
+    """Return (N, 4) level, glr, and the cumulative sum with each slack."""
     found = [statistics_of_log(floor, *rows, slack=slack) for slack in SLACKS]
     return np.column_stack([found[0][:, 0], found[0][:, 2], *(x[:, 1] for x in found)])
 
 
 def at_equal_rate(gains: Array, lag: int, hours: float) -> dict[str, Any]:
-    """Delays at one false alarm in ten minutes, by rise and size of the contact."""
+    """Return delays at one false alarm in ten minutes, by rise and size of the contact."""
     learnt = Record(30_000, 1, None, gains, lag)
     result = identify_batch(learnt.wrench, *learnt.motion).identification
     phi, offsets = result.phi, result.offsets
@@ -257,8 +257,10 @@ def at_equal_rate(gains: Array, lag: int, hours: float) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--hours", type=float, default=1.0, help="Free motion for thresholds.")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument(
+        "--hours", type=float, default=1.0, help="hours of free motion for thresholds"
+    )
     figures = measure() if (given := parser.parse_args()) else {}
     figures["gains and delay right"] = at_equal_rate(RIGHT, 0, given.hours)
     figures["gains and delay wrong"] = at_equal_rate(GAINS, LATE, given.hours)

@@ -2,20 +2,20 @@
 
 `python benchmarks/contact_in_station.py [--minutes 100] [--json FILE]`. The load, its offsets and
 the noise floor are identified first, by the station's own sensor (JR3, with noise, random walk and
-drift), with another seed. Three questions, all times in ms from the first touch:
+drift), with another seed. All times are in ms from the first touch:
 
-- The paper's contact (`contact_transition`, five seeds): when the detector notices it; and by the
-  size of the force, what share of the free motion must cry wolf so that the contact is noticed at
-  all, or within 10 ms. Raw is the measured force, tared at the start; gravity_only has the static
-  weight taken away, by the identification; eliminated is Eq. (13).
-- The networks of `PRESETS`, without their losses: when the flag arrives at the hand, beyond the
-  one-way delay. A playout buffer as long as the longest delay keeps the command smooth; without
-  it, jitter tears at the arm until accelerometer and motors saturate (`torn` for comparison).
-- Fast free motion (`--minutes`, 0 for none): the hand swings in all directions and turns, as fast
+- The paper's contact (`contact_transition`, five seeds): time of detection; for each size of the
+  force, the share of false alarms in free motion that is necessary to detect the contact at all, or
+  within 10 ms. `raw` is the measured force, tared at the start; `gravity_only` is without the
+  identified static weight; `eliminated` is Eq. (13).
+- The networks of `PRESETS`, without their losses: arrival of the flag at the hand, beyond the
+  one-way delay. A playout buffer of the longest delay keeps the command smooth; without it, jitter
+  accelerates the arm until accelerometer and motors saturate (`torn`, for comparison).
+- Fast free motion (`--minutes`, 0 for none): the hand swings in all directions and rotates, as fast
   as the arm can follow, in runs of five minutes with a seed each, without taring in between.
-  `false_share` is the share of time that the flag was up, `false_contacts` how often it rose.
+  `false_share` is the share of time with a raised flag, `false_contacts` the number of its rises.
 
-`--processes` runs of free motion go at once. A minute takes some 20 s of a core.
+`--processes` runs of free motion run in parallel. One minute takes some 20 s of a core.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def run(scenario: Scenario, known: Known) -> SimulationResult:
 
 
 def onset(result: SimulationResult, name: str, start: float) -> float | None:
-    """How long after `start` [s] the flag is first up [ms]; None if it never is."""
+    """Return the time from `start` [s] until the flag is up [ms]; None if it never is."""
     up = result.t[(result[name][:, 0] > 0) & (result.t >= start)]
     return 1e3 * float(up[0] - start) if len(up) else None
 
@@ -95,7 +95,8 @@ def papers_contact(progress: Callable[..., None]) -> dict[str, Any]:
         delays.append(onset(result, "contact", start))
         false += int(result["contact"][result.t < start].sum())
         forces = sizes(result, known[0], scenario)
-        # What a contact leaves in the filter of the sensor is neither.
+        # Residual effects of a contact in the sensor's filter count neither as contact nor as free
+        # motion.
         free = ~touched & ((result.t < start) | (result.t > result.t[touched][-1] + 0.02))
         first = touched & (result.t < start + 0.01)
         share.append([float((x[free] >= x[touched].max()).mean()) for x in forces.values()])
@@ -112,7 +113,7 @@ def papers_contact(progress: Callable[..., None]) -> dict[str, Any]:
 
 
 def sizes(result: SimulationResult, estimate: Array, scenario: Scenario) -> dict[str, Array]:
-    """|f| by what was taken away, (N,) each."""
+    """Return |f| (N,) by the eliminated part."""
     wrench, s, omega, alpha = sensor_samples(result)
     offsets, phi, rest = estimate[:6], estimate[6:], np.zeros_like(s)
     gravity = s - sensor_accelerations(slave_arm(scenario), result["joint_position"], s)
@@ -125,7 +126,7 @@ def sizes(result: SimulationResult, estimate: Array, scenario: Scenario) -> dict
 
 
 def arrivals(progress: Callable[..., None]) -> dict[str, Any]:
-    """By network: the one-way delay, when the slave noticed and when the hand knew [ms]."""
+    """Return by network the one-way delay, and the times of detection and arrival [ms]."""
     plain = detecting("contact_transition", rates__log_hz=2000.0)
     known = identified(plain, 100)
     table: dict[str, Any] = {}
@@ -157,7 +158,7 @@ def arrival(plain: Scenario, known: Known, line: Any, delay: float) -> dict[str,
 
 
 def fast_motion(seed: int, seconds: float) -> Scenario:
-    """The hand swings up and down, sideways and turning with less, by turns slower and faster."""
+    """Return a hand motion at varying speed: up and down, with less lateral motion and rotation."""
     rng = np.random.default_rng(seed)
     intent = []
     for start in np.arange(0.0, seconds + 1.0, SEGMENT_S):
@@ -177,13 +178,13 @@ def fast_motion(seed: int, seconds: float) -> Scenario:
         simulation__settle=1.0,
         simulation__duration=seconds,
         operator=OperatorConfig(grip="firm", intent=intent),
-        # A flag is up for 20 ms at least.
+        # A flag stays up for at least 20 ms.
         rates__log_hz=100.0,
     )
 
 
 def free_run(seconds: float, seed: int) -> dict[str, float]:
-    """One run of fast free motion, and how fast it was."""
+    """Return one run of fast free motion, and its speed."""
     scenario = fast_motion(seed, seconds)
     result = run(scenario, identified(scenario, seed + 1000))
     flags = result["contact"][:, 0]
@@ -226,9 +227,11 @@ def free_motion(minutes: float, processes: int, progress: Callable[..., None]) -
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=100.0, help="of fast free motion")
-    parser.add_argument("--processes", type=int, default=2, help="for the free motion")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--minutes", type=float, default=100.0, help="minutes of fast free motion (default: 100)"
+    )
+    parser.add_argument("--processes", type=int, default=2, help="processes for the free motion")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     with show_progress(True) as stage:
         figures: dict[str, Any] = {"papers_contact": papers_contact(stage("The paper's contact"))}

@@ -1,8 +1,9 @@
 """How many planted faults of a dataset are named, and how good are wrench and contacts?
 
 Usage: python benchmarks/dataset.py [EPISODES] [FRAMES] [--rates HZ ...] [--tools N] [--json FILE]
-EPISODES are the clean ones of each dataset; FRAMES are for the CPU time, followed by a run that is
-killed six times (0: neither).
+EPISODES is the number of clean ones in each dataset. FRAMES is the length of the dataset for the
+CPU
+time, followed by a run that is killed six times (0: neither).
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Which planted faults of a wrench do published checkers of robot-learning datasets name?
 
 `python benchmarks/dataset_checkers.py [--bin FOLDER] [--json FILE]` plants each of the 20 faults of
-`dataset.py` into episode 8 of 10 (30 fps, 0.95 kg) and asks `drake-teleop dataset --identify` and
-the programs robovet, lerobot-doctor, rdq and kalanos of the extra `bench` (or in FOLDER). A checker
-names a fault if it reports a warning or an error that it does not report of the clean dataset. Each
-checker also judges the copies with our columns: its verdict has to be the one of the input.
+`dataset.py` into episode 8 of 10 (30 fps, 0.95 kg). Then it runs `drake-teleop dataset --identify`
+and the programs robovet, lerobot-doctor, rdq and kalanos of the extra `bench` (or in FOLDER). A
+checker names a fault if it reports a warning or an error that it does not report for the clean
+dataset. Each checker also judges the copies with our columns: its verdict must be that of the
+input.
 """
 
 from __future__ import annotations
@@ -96,8 +97,8 @@ def judge(folder: Path, fault: str | None, programs: dict[str, str]) -> dict[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bin", type=Path, help="folder of the programs (default: of PATH)")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--bin", type=Path, help="folder of the programs (default: those of PATH)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     folder = given.bin or Path(sys.executable).parent
     programs = {name: shutil.which(name, path=str(folder)) or name for name in CHECKERS}

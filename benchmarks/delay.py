@@ -2,12 +2,13 @@
 
 `python benchmarks/delay.py [--json FILE] [--seeds N]` presses on a wall, holds, lets go and rests
 with `drake_teleop.lab.comparison.one_dof` over networks with jitter 0, 25 and 50 % of the delay and
-loss 0, 10 and 30 %, with N (6) seeds each. Each method runs at the round trip that it is known to
-carry, `charged_tdpa` at several and before a stiffer wall, no method at 15 ms. A row has the worst
-of its runs: stable in how many, force error while holding (in the last 1.9 s of 5 s, and of 13 s:
-"settled"), slave against master two seconds after contact, rms of the force in free motion, median
-delay of the force's rise (none where a drag hides it in some run), least energy at the port of
-held wrenches."""
+loss 0, 10 and 30 %, with N (6) seeds each. Each method runs at the round trip that it tolerates,
+`charged_tdpa` at several and before a stiffer wall, no method at 15 ms. A row has the worst of its
+runs: number of stable runs; force error while holding (in the last 1.9 s of 5 s, and of 13 s:
+"settled"); slave against master two seconds after contact; rms of the force in free motion; median
+delay of the force's rise (none if drag hides it in some run); least energy at the port of held
+wrenches.
+"""
 
 from __future__ import annotations
 
@@ -48,13 +49,13 @@ CASES = (
     *(("charged_tdpa", PAPER, rtt) for rtt in (0.015, 0.05, 0.1, 0.3, 0.6, 1.0)),
     *(("charged_tdpa", STIFF, rtt) for rtt in (0.015, 0.05, 0.1, 0.3)),
 )
-CARRIED = CASES[1:]  # without "none"
+CARRIED = CASES[1:]  # methods except "none"
 AIM = [case for case in CASES if case[0] == "charged_tdpa"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """The worst of the runs of a case; see the module."""
+    """Worst figures of the runs of a case; see the module."""
 
     method: str
     wall: float
@@ -77,7 +78,7 @@ def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task
 
 
 def row(method: str, wall: float, round_trip: float, seeds: int) -> Row:
-    """Runs a case over all networks."""
+    """Run a case over all networks."""
     found, settled = [], []
     for jitter, loss, seed in itertools.product(JITTER, LOSS, range(seeds)):
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -102,7 +103,7 @@ def row(method: str, wall: float, round_trip: float, seeds: int) -> Row:
 
 
 def holds(rows: list[Row]) -> bool:
-    """Whether every method carries its delay, no method does not, and the aim is reached."""
+    """Return whether all methods tolerate their delay, `none` does not, and the aim is reached."""
     by_case = {(one.method, one.wall, one.round_trip): one for one in rows}
     return (
         by_case[CASES[0]].stable == 0
@@ -117,10 +118,10 @@ def holds(rows: list[Row]) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the study and prints it; returns 0 if `holds`."""
+    """Run and print the study; return 0 if `holds`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--seeds", type=int, default=6, help="seeds of each network")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--seeds", type=int, default=6, help="seeds of each network (default: 6)")
     options = parser.parse_args(arguments)
     began = time.monotonic()
     _run("none", PAPER, NetworkConfig(), 0, Task())  # compiles, before the processes fork

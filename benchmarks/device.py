@@ -2,15 +2,14 @@
 
     python benchmarks/device.py [--seconds 10] [--drive] [--json FILE]
 
-`link_`: a virtual device in a process of its own at 1 kHz over UDP, and here a wall by the same
-handlers as a drive's: time from taking a packet to having sent the force, and at the device how
-late its force is; Python's garbage waits, as in the server. `silent_`: the force at the device 50
-ms after the station falls silent.
-`leaf_` and `wall_`: the device's client with and without its passivity observer in simulated time,
-at the leaf (291 N/m at the hand) and a wall of 6 kN/m, up to five samples late, and as late as was
-measured just now: least energy of the port [J]; how far the resting hand moves to and fro [m].
-`station_wall_`: likewise with the whole station between, in simulated time. `fuzz_`: messages that
-are none. With --drive the whole station in real time under the device.
+`link_`: a virtual device in another process at 1 kHz over UDP, and here a wall by the handlers of a
+drive: time from taking a packet to sending the force, and the age of the force at the device.
+Python's garbage collection waits, as in the server. `silent_`: the force at the device 50 ms after
+the station falls silent. `leaf_` and `wall_`: the device's client with and without its passivity
+observer in simulated time, at the leaf (291 N/m at the hand) and a wall of 6 kN/m. Forces are up to
+five samples late, and as late as just measured. Figures are the least energy of the port [J], and
+the oscillation of the resting hand [m]. `station_wall_`: likewise with the whole station, in
+simulated time. `fuzz_`: random invalid messages. `--drive` adds the whole station in real time.
 Baselines: the same without the observer; the share of time in which a process waited for a core.
 """
 
@@ -45,7 +44,7 @@ _TICK = 1e-3
 
 
 def client(port: int, seconds: float, figures: Path, *more: str) -> subprocess.Popen[bytes]:
-    """A virtual device in a process of its own."""
+    """Start a virtual device in another process."""
     module = "drake_teleop.live.device_client"
     station = f"udp://127.0.0.1:{port}"
     line = [sys.executable, "-m", module, "virtual", station, "--seconds", str(seconds)]
@@ -53,12 +52,12 @@ def client(port: int, seconds: float, figures: Path, *more: str) -> subprocess.P
 
 
 def waited() -> float:
-    """For how long this thread has waited for a core [s]."""
+    """Return the time that this thread has waited for a core [s]."""
     return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) * 1e-9
 
 
 def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
-    """Figures of the link at 1 kHz, and how late forces were at the device, in ticks."""
+    """Return figures of the link at 1 kHz, and the ages of forces at the device in ticks."""
     with tempfile.TemporaryDirectory() as folder:
         link, told = DeviceLink("udp://127.0.0.1:0"), Path(folder) / "device.json"
         device = client(link.port, seconds, told, "--depth", "0.01", "--grip", "medium")
@@ -100,7 +99,7 @@ def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
 
 
 def silent() -> dict[str, float]:
-    """The largest force of a guard from 50 ms of silence on, whatever was commanded before [N]."""
+    """Return the largest force of a guard after 50 ms of silence, for any previous command [N]."""
     largest, random = 0.0, np.random.default_rng(0)
     for _ in range(200):
         guard = DeviceGuard(DeviceLimits(37.5))
@@ -115,12 +114,12 @@ def silent() -> dict[str, float]:
 
 
 def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> tuple[float, float]:
-    """Least energy of the port [J]; how far the hand moves to and fro when it should rest [m].
+    """Return the least energy of the port [J] and the oscillation of the hand at rest [m].
 
     Args:
         stiffness: of the wall [N/m].
         grip: of the virtual hand.
-        late: by how many ticks a force is late, in a circle.
+        late: ages of the forces in ticks, in a cycle.
         observe: whether the observer is on.
     """
     virtual, most = VirtualDevice(tapping_motion(0.02), grip), int(late.max())
@@ -128,7 +127,7 @@ def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> 
     least, resting, newest = 0.0, [], 0
     for k in range(4000):
         heights.append(virtual.position[2])
-        newest = max(newest, len(heights) - 1 - int(late[k % len(late)]))  # never an older one
+        newest = max(newest, len(heights) - 1 - int(late[k % len(late)]))  # in order
         push = max(-stiffness * heights[newest], 0.0)
         force = guard.limit_wrench(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, _TICK)
         virtual.simulate_motion(force[:3], _TICK)
@@ -139,7 +138,7 @@ def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> 
 
 
 def passive(measured: np.ndarray) -> dict[str, float]:
-    """Energy and rest at leaf and wall, with every grip, with and without the observer."""
+    """Return energy and rest at leaf and wall, with every grip, with and without the observer."""
     figures: dict[str, float] = {}
     delays = {f"{n}_late": np.array([n]) for n in (0, 1, 2, 5)} | {"as_measured": measured}
     for observe, word in ((True, "observed"), (False, "bare")):
@@ -153,9 +152,9 @@ def passive(measured: np.ndarray) -> dict[str, float]:
 
 
 def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
-    """As `pressed`, with the whole station in simulated time: slices of 2 ms, a force 2 ms late.
+    """Return `pressed` with the whole station in simulated time: a force is 2 ms late.
 
-    The wall and the tool's ball make 6 kN/m at the hand, if the arm were rigid.
+    The wall and the tool's ball make 6 kN/m at the hand, for a rigid arm.
     """
     ball, scale = 4e5, 1 / 17.5
     scenario = live_scenario(with_task_space_device(LoadScenario("contact_transition")))
@@ -185,7 +184,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
 
 
 def fuzzed(count: int = 10_000) -> dict[str, float]:
-    """Values that are not finite among what random packets and texts led to, of each kind."""
+    """Return the number of non-finite values after random packets and texts of each kind."""
     random, wrong, refused = np.random.default_rng(1), 0, 0
     good = pack_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
     place = {"cursor_position": {"x": 0.1, "y": 0.2, "z": 0.3}}
@@ -211,7 +210,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
 
 
 def driven(seconds: float) -> dict[str, float]:
-    """The whole station under the device, in real time, without a page."""
+    """Run the whole station with the device in real time, without a page."""
     scenario = live_scenario(with_task_space_device(LoadScenario("contact_transition")))
     load, clock = identified_load(scenario), time.perf_counter
     link = DeviceLink("udp://127.0.0.1:0")
@@ -219,7 +218,7 @@ def driven(seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
-        while live.is_simulation_halted or link.is_device_silent(clock()):  # until it has begun
+        while live.is_simulation_halted or link.is_device_silent(clock()):  # until it runs
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())
@@ -246,10 +245,10 @@ def driven(seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--drive", action="store_true", help="the whole station too")
+    parser.add_argument("--drive", action="store_true", help="run the whole station too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     with without_garbage_collection():  # as in the server

@@ -1,12 +1,13 @@
 """For which stiffness, grip and round trip does each method hold a wall?
 
-`python benchmarks/domain.py [--method M ...] [--json FILE]` lets `lab.comparison.one_dof`
-run its usual task over a constant delay: a hand presses 20 mm into a wall, holds for 5 s, lets go.
-Grips are light, medium and firm, walls 0.5 to 50 kN/m, round trips 1 ms to 2.6 s (there the hold is
-10 s longer); nothing is told of the hand. Stable is a run at rest within 0.5 mm, holding and
-afterwards; good is one that is also quiet (the force's standard deviation below 5 %) and shows what
-is pressed within 1 %; strong one that is good and shows 95 % of what would be felt without delay;
-prompt one that is felt within 10 % of that two round trips and 0.5 s after the hand has pressed.
+`python benchmarks/domain.py [--method M ...] [--json FILE]` runs the usual task of
+`lab.comparison.one_dof` over a constant delay: a hand presses 20 mm into a wall, holds for 5 s and
+lets go. Grips are light, medium and firm, walls 0.5 to 50 kN/m, round trips 1 ms to 2.6 s (there
+the hold is 10 s longer); the methods have no information about the hand. A run is stable if it is
+at rest within 0.5 mm, while holding and afterwards. It is good if it is also quiet (standard
+deviation of the force below 5 %) and displays the contact force within 1 %. It is strong if it is
+good and displays 95 % of the force without delay. It is prompt if the force is within 10 % of the
+final one from two round trips and 0.5 s after the press.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ COUNTED = ("stable", "good", "strong", "prompt")
 
 
 def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
-    """Figures of one hold: method, grip, stiffness of the wall, round trip."""
+    """Return the figures of one hold: method, grip, stiffness of the wall, round trip."""
     method, grip, wall, round_trip = case
     longer = 10.0 if round_trip > 2.0 else 0.0
     task = Task(release_start=11.5 + longer, release_end=12.5 + longer, end=17.0 + longer)
@@ -57,25 +58,25 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
         intent=operator_intent(task),
     )  # fmt: skip
     found = figures_of_run(run, model, task)
-    # The hand's spring, the wall's and the servo's, one behind the other.
+    # The springs of hand, wall and servo are in series.
     felt = model.force_scale / (1.0 / wall + 1.0 / model.servo_stiffness)
     undelayed = DEPTH / (1.0 / stiffness + 1.0 / felt)
     quiet = found.chatter < QUIET * found.felt_force
     good = found.stable and quiet and abs(found.force_error) < EXACT
     share = found.felt_force / undelayed
     holds = (run.t >= task.press_end + 2 * round_trip + SOON) & (run.t < task.release_start)
-    at_last = np.mean(run.felt[holds & (run.t >= task.release_start - task.rest_window)])
+    at_last = np.mean(run.hand_force[holds & (run.t >= task.release_start - task.rest_window)])
     return {
         "stable": found.stable,
         "good": good,
         "strong": good and share > STRONG,
         "felt": share,
-        "prompt": bool(np.all(np.abs(run.felt[holds] / at_last - 1.0) < NEAR)),
+        "prompt": bool(np.all(np.abs(run.hand_force[holds] / at_last - 1.0) < NEAR)),
     }
 
 
 def reach(table: dict[tuple[str, float, float], dict[str, float]], grip: str, wall: float) -> str:
-    """The longest round trip up to which all are stable, and up to which all are good [ms]."""
+    """Return the longest round trips up to which all runs are stable, and are good [ms]."""
     reached = []
     for what in ("stable", "good"):
         held = [bool(table[grip, wall, round_trip][what]) for round_trip in ROUND_TRIPS] + [False]
@@ -85,10 +86,10 @@ def reach(table: dict[tuple[str, float, float], dict[str, float]], grip: str, wa
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs all methods over all cases and prints two tables."""
+    """Run all methods over all cases and print two tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--json", metavar="FILE", help="writes the figures there")
+    parser.add_argument("--json", metavar="FILE", help="file for the figures")
     asked = parser.parse_args(arguments)
     places = list(itertools.product(GRIPS, WALLS, ROUND_TRIPS))
     cases = [(method, *place) for method in asked.method for place in places]

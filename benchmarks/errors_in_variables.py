@@ -1,13 +1,13 @@
 """How do noisy accelerations bias the load, and which estimator corrects it?
 
-The tool of the station, turned and moved by sines for 1.5 s at 1 kHz, 200 records with other noise:
-the JR3's of the station, and the level "High" of the UTIAS protocol (Nadeau, Giamou, Kelly, ICRA
-2023). Recursive least squares (RLS), instrumental variables (RIV) and total least squares (RTLS),
-and the batch estimators. The instruments are the commanded motion: 10 ms early, with the noise of
-differentiated encoders. For every parameter whose RLS bias exceeds three standard errors of its
-mean: the bias of the others over that of RLS. A bias of less than two standard errors of its own
-is no bias as far as that many records can tell. Times are per sample, in one compiled loop, against
-the same RLS in plain numpy.
+The station's tool rotates and moves by sines for 1.5 s at 1 kHz, in 200 records with different
+noise: that of the station's JR3, or the level "High" of the UTIAS protocol (Nadeau, Giamou, Kelly,
+ICRA 2023). The estimators are recursive least squares (RLS), instrumental variables (RIV) and total
+least squares (RTLS), and the batch estimators. The instruments are the commanded motion, 10 ms
+early, with the noise of differentiated encoders. Parameters count if their RLS bias exceeds three
+standard errors of its mean; the figure is the bias of another estimator over that of RLS. A bias
+below two of its own standard errors is not significant. Times are per sample, in one compiled
+loop, next to the same RLS in plain numpy.
 
     python benchmarks/errors_in_variables.py [--seeds 200] [--first 0] [--json FILE]
 """
@@ -44,12 +44,12 @@ LEVELS = {
     "JR3": ((0.25, 0.012), (0.06, 0.002, 1.5)),
     "UTIAS High": ((0.2, 0.01), (0.1, 0.0, 1.0)),
 }
-# Of the instruments: differentiated encoders.
+# Noise of the instruments: differentiated encoders.
 INSTRUMENT_NOISE = (0.05, 0.001, 0.5)
 
 
 def motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s, omega, alpha), (N, 3) each: roll, pitch and yaw, and So's acceleration, are sines."""
+    """Return (s, omega, alpha), (N, 3) each: the angles and the acceleration of So are sines."""
     t = np.arange(0.0, DURATION, 1 / RATE)
     rng = np.random.default_rng(1)
     frequency = 2 * np.pi * np.array([1.0, 2.0, 3.0]) / DURATION
@@ -75,7 +75,7 @@ def motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def record(level: str, seed: int) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Wrench (N, 6), measured motion (three (N, 3)) and instruments (N, 9) of one seed."""
+    """Return wrench (N, 6), measured motion (three (N, 3)) and instruments (N, 9) of one seed."""
     rng, clean = np.random.default_rng(seed), motion()
     wrench_std, motion_std = LEVELS[level]
     shape = clean[0].shape
@@ -88,7 +88,7 @@ def record(level: str, seed: int) -> tuple[np.ndarray, list[np.ndarray], np.ndar
 
 
 def estimators(level: str) -> dict[str, Any]:
-    """The recursive ones, new."""
+    """Return new recursive estimators."""
     wrench_std, motion_std = (np.repeat(std, 3) for std in LEVELS[level])
     return {
         "RLS": RecursiveLeastSquares(wrench_std),
@@ -98,10 +98,11 @@ def estimators(level: str) -> dict[str, Any]:
 
 
 def bound(level: str) -> np.ndarray:
-    """(16,) least standard deviations of an unbiased estimate, each sample's motion unknown.
+    """Return the least standard deviations (16,) of an unbiased estimate for unknown true motion.
 
-    Cramer-Rao: the information X^T R^-1 X of the samples, R the covariance of the errors that noise
-    of wrench and motion make in the six equations, to first order in the motion's noise.
+    Cramer-Rao: the samples have the information X^T R^-1 X. R is the covariance of the errors of
+    the
+    six equations by noise of wrench and motion, to first order in the motion's noise.
     """
     wrench_std, motion_std = LEVELS[level]
     clean = np.hstack(motion())
@@ -122,7 +123,7 @@ def bound(level: str) -> np.ndarray:
 def study(
     level: str, seeds: int, batch: tuple[str, ...] = (), first: int = 0
 ) -> dict[str, np.ndarray]:
-    """Errors (seeds, 16) of each estimator after 1.5 s; the records are those from `first` on."""
+    """Return errors (seeds, 16) of each estimator after 1.5 s, for the records from `first` on."""
     errors: dict[str, list[np.ndarray]] = {}
     wrench_std, (s, omega, alpha) = LEVELS[level]
     noise = NoiseStd(np.repeat(wrench_std, 3), s, omega, alpha)
@@ -141,7 +142,7 @@ def study(
 
 
 def summary(level: str, errors: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Bias of each over that of RLS where RLS has one; errors of mass and centre of mass."""
+    """Return the bias over that of RLS, where it is significant; errors of mass and its centre."""
     least = bound(level)
     means = {name: rows.mean(axis=0) for name, rows in errors.items()}
     standard = {n: rows.std(axis=0, ddof=1) / len(rows) ** 0.5 for n, rows in errors.items()}
@@ -150,7 +151,7 @@ def summary(level: str, errors: dict[str, np.ndarray]) -> dict[str, Any]:
     figures: dict[str, Any] = {
         "biased": [n for n, b in zip(PARAMETER_NAMES, biased, strict=True) if b]
     }
-    # A fifth of the bias of RLS in standard errors of the best unbiased estimator's mean.
+    # A fifth of the RLS bias, in standard errors of the best unbiased estimator's mean.
     of_best = 0.2 * np.abs(means["RLS"]) / least * len(errors["RLS"]) ** 0.5
     figures["a_fifth_over_least_standard_error"] = of_best[biased].tolist()
     for name, rows in errors.items():
@@ -173,7 +174,7 @@ def summary(level: str, errors: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def numpy_rls(F: np.ndarray, measured: list[np.ndarray]) -> float:
-    """Microseconds a sample of RLS in plain numpy, six rows at once, V given."""
+    """Return the microseconds per sample of RLS in plain numpy: six rows at once, V given."""
     V, theta, P = regressor(*measured), np.zeros(16), np.diag(np.square(PRIOR_STD))
     R = np.diag(np.repeat(np.square(LEVELS["JR3"][0]), 3))
     rows = np.concatenate([np.broadcast_to(np.eye(6), (len(F), 6, 6)), V], axis=2)
@@ -187,7 +188,7 @@ def numpy_rls(F: np.ndarray, measured: list[np.ndarray]) -> float:
 
 
 def times(repetitions: int = 15) -> dict[str, float]:
-    """Least CPU microseconds a sample, interleaved."""
+    """Return the least CPU microseconds per sample, interleaved."""
     F, measured, commanded = record("JR3", 0)
     best: dict[str, float] = {}
     for _ in range(repetitions):
@@ -204,8 +205,8 @@ def times(repetitions: int = 15) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--first", type=int, default=0, help="first seed (default: 0)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     report: dict[str, Any] = {"seeds": arguments.seeds}
     for level in LEVELS:

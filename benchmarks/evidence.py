@@ -1,13 +1,13 @@
 """Is each claim of README and docs shown by a run, and when was it run?
 
     python benchmarks/evidence.py                       writes docs/evidence.md and the README
-    python benchmarks/evidence.py RUN ... [--beside T]  runs these first, and keeps their figures
+    python benchmarks/evidence.py RUN ... [--beside T]  also makes these runs first
 
 The page lists each claim of the docs (`evidence_claims.py`) with the figure of a run, the bound,
-the command, the date and the commit, then the claims that are not met or not shown. The README of
-this folder lists the scripts, their questions and the same figures. `records/` contains the figures
-of each run as its `--json` wrote them. `--beside` names other programs that ran at the same time
-(default: nothing else). `--from FILE` keeps the figures of a run that was made before.
+the command, the date and the commit, and then the claims that are not met or not shown. The README
+of this folder lists the scripts, their questions and the same figures. `records/` contains the
+figures of each run, as `--json` writes them. `--beside` names other programs that ran at the same
+time (default: nothing else). `--from FILE` stores the figures of an earlier run.
 """
 
 from __future__ import annotations
@@ -57,11 +57,13 @@ A claim with a test is checked by every run of the tests and has no figure here.
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs what is named, then writes the page."""
+    """Make the named runs, then write the page and the README."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", nargs="*", choices=[*RUNS, []], metavar="RUN")
-    parser.add_argument("--beside", default="nothing else", help="what else ran on the machine")
-    parser.add_argument("--from", dest="file", type=Path, help="the figures of such a run")
+    parser.add_argument(
+        "--beside", default="nothing else", help="other programs that ran at the same time"
+    )
+    parser.add_argument("--from", dest="file", type=Path, help="figures of an earlier run")
     asked = parser.parse_args(arguments)
     for name in asked.run:
         figures = json.loads(asked.file.read_text()) if asked.file else run(name)
@@ -72,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(name: str) -> Any:
-    """The figures of one of `RUNS`; exit status 1 is a bound of its own that it missed."""
+    """Return the figures of one of `RUNS`; exit status 1 means that it missed its own bound."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "summary.json"
         command = RUNS[name].replace("FILE", str(file)).replace("FOLDER", folder)
@@ -86,7 +88,7 @@ def run(name: str) -> Any:
 
 
 def keep(name: str, figures: Any, beside: str) -> None:
-    """Writes a record of today and of the package's newest commit."""
+    """Write a record with the date and the package's newest commit."""
     if isinstance(figures, dict):
         figures = {name: value for name, value in figures.items() if name != "records"}
     commit = _git("log", "-1", "--format=%h", "--", "drake_teleop") or "unknown"
@@ -110,7 +112,7 @@ def _git(*arguments: str) -> str:
 
 
 def _rounded(figures: Any) -> Any:
-    """With six digits: more are never claimed."""
+    """Return figures with six digits, more than any claim has."""
     if isinstance(figures, dict):
         return {key: _rounded(value) for key, value in figures.items()}
     if isinstance(figures, list):
@@ -119,7 +121,7 @@ def _rounded(figures: Any) -> Any:
 
 
 def records() -> dict[str, dict[str, Any]]:
-    """All that are kept, by name."""
+    """Return all stored records by name."""
     return {
         path.stem: json.loads(path.read_text(encoding="utf-8"))
         for path in sorted(RECORDS.glob("*.json"))
@@ -127,7 +129,7 @@ def records() -> dict[str, dict[str, Any]]:
 
 
 def summary() -> str:
-    """How many claims are met, missed, tested, and not shown."""
+    """Return the numbers of claims that are met, missed, tested, and not shown."""
     known = records()
     measured = [c for c in CLAIMS if isinstance(c, Claim) and c.run in known]
     met = sum(c.met(known[c.run]["figures"]) for c in measured)
@@ -140,7 +142,7 @@ def summary() -> str:
 
 
 def page() -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     known = records()
     parts = [_HEAD, f"{summary()[0].upper()}{summary()[1:]}.\n"]
     for section in dict.fromkeys(claim.section for claim in CLAIMS):

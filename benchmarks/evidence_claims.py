@@ -73,55 +73,55 @@ RUNS = {
         "benchmarks/tuning.py --stations 1 --draws 60 --station-draws 4 --jobs 1 --json FILE"
     ),
 }
-"""Name of a record -> its command; FILE takes the figures, FOLDER summary.json."""
+"""Name of a record -> its command; FILE is the file of figures, FOLDER that of summary.json."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One promise, and the figure that shows it."""
+    """Claim with the figure that shows it."""
 
     section: str
     says: str
     where: str
-    """Port, range and assumption."""
+    """Conditions: station, range and assumption."""
     page: str
-    """Page of docs/ with the promise."""
+    """Page of docs/ with the claim."""
     run: str
     """One of `RUNS`."""
     figure: Callable[[Any], float]
-    """The figure, from the output of the run."""
+    """Function from the output of the run to the figure."""
     unit: str = ""
     least: float = -math.inf
     most: float = math.inf
 
     def value(self, figures: Any) -> float:
-        """The figure, in `unit`."""
+        """Return the figure in `unit`."""
         return float(self.figure(figures))
 
     def met(self, figures: Any) -> bool:
-        """Whether it is within the bounds; a NaN is not."""
+        """Return whether the figure is within the bounds; NaN is not."""
         return self.least <= self.value(figures) <= self.most
 
     def text(self, figures: Any) -> str:
-        """The figure with its unit."""
+        """Return the figure with its unit."""
         return _said(self.value(figures), self.unit)
 
     @property
     def bound(self) -> str:
-        """The bounds with their unit."""
+        """Return the bounds with their unit."""
         if self.least == self.most:
             return _said(self.most, self.unit)
         parts = [
             f"{sign} {_said(x, self.unit)}"
             for sign, x in (("≥", self.least), ("≤", self.most))
-            if math.isfinite(x) and (x != 0.0 or sign == "≤")  # a magnitude has no lower bound
+            if math.isfinite(x) and (x != 0.0 or sign == "≤")  # magnitudes have no lower bound
         ]
         return " and ".join(parts)
 
 
 @dataclass(frozen=True)
 class InTests:
-    """A promise that a test checks in every run of the tests."""
+    """Claim that a test checks in every run of the tests."""
 
     section: str
     says: str
@@ -132,7 +132,7 @@ class InTests:
 
 @dataclass(frozen=True)
 class NotShown:
-    """A promise, or an apparent one, that no run shows."""
+    """Claim, or apparent claim, that no run shows."""
 
     section: str
     says: str
@@ -414,7 +414,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("held-out motion, 30 Hz", "logs.md", "peers"),
         *(lambda f: f["kth.left_N_m"] / f["ours.left_N_m"], "times ours", 1.0),
     ),
-    # Publications: what is claimed there, and here in the figure
+    # Publications: their claim, and the figure of the simulation
     Claim(
         *(PUBLISHED, "Recursive least squares of gravity and bias removes over 95 % of the force"),
         *("arXiv 2604.23696; slow motion, median of 5 loads", "logs.md", "peers_rls"),
@@ -678,7 +678,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         lambda f: max(max(station["from the sampled axis, %"].values()) for station in f.values()),
         *("%", 0.0, 1.0),
     ),
-    # Stations of one's own
+    # Custom stations
     Claim(
         *(OWN, "Difference of the sensor's force from the plant's reaction port"),
         *("ideal sensor, all arms and devices, free and in contact", "station.md", "stations"),

@@ -1,12 +1,12 @@
 """How good is an excitation trajectory, how soon, and how much does the criterion matter?
 
-`python benchmarks/excitation.py [--seeds 7] [--json FILE]` designs for the station's slave with its
-tool and 30 % more, with every limit, and prints
+`python benchmarks/excitation.py [--seeds 7] [--json FILE]` designs trajectories for the station's
+slave with its tool and 30 % more, with every limit, and prints
 
 * the value of the best trajectory that passed the check (Drake, 1 kHz, collisions included) after
-  a second and later, median and worst of the seeds; thread CPU time of the optimiser, compilation
-  excluded; the check's time is stated next to it. Baseline: the same SLSQP on the same functions
-  from the same candidate with finite differences.
+  a second and later, median and worst of the seeds; thread CPU time of the optimiser without
+  compilation, and the time of the check. Baseline: the same SLSQP on the same functions
+  from the same candidate with finite differences;
 * the errors of whitened least squares after the motions of each criterion, 16 draws each, with
   errors that are not white noise: gains of 1 % and cross-talk of 0.3 %, the wrench 1 ms late, and
   noise in the measured accelerations and angular velocity.
@@ -44,7 +44,7 @@ from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.scenario import LoadScenario
 
-#: (criterion, period [s], soon [s], later [s]), five harmonics.
+#: (criterion, period [s], short and long computation time [s]), five harmonics.
 ROWS = (
     ("kappa_w10", 6.0, 1.0, 3.0),
     ("kappa_w10", 10.0, 1.0, 2.0),
@@ -73,7 +73,7 @@ def task_of(robot: Robot, criterion: str, period: float) -> DesignTask:
 
 
 def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dict[str, Any]:
-    """Checked values after both times, by seed, and the time of one check."""
+    """Return the checked values after both times, by seed, and the time of one check."""
     criterion, period, soon, later = row
     task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
@@ -95,7 +95,7 @@ class _TimeIsUpError(Exception):
 
 
 def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -> float:
-    """kappa_w10 on the grid after so many seconds of SLSQP without gradients; inf: nothing."""
+    """Return kappa_w10 on the grid after a time of SLSQP without gradients, or inf."""
     problem = DesignProblem(task_of(robot, "kappa_w10", period))
     rng = np.random.default_rng(seed)
     candidates = [problem.candidate(rng, near_home=k % 2 == 0) for k in range(64)]
@@ -129,7 +129,7 @@ def finite_differences(robot: Robot, period: float, seconds: float, seed: int) -
 
 
 def errors(robot: Robot, criterion: str, seeds: int) -> list[float]:
-    """Rms error of mass [%], centre of mass [mm] and inertia about it [%]."""
+    """Return the rms errors of mass [%], centre of mass [mm] and inertia about it [%]."""
     squares = []
     for seed in range(seeds):
         motion = excite(robot, criterion=criterion, seed=seed).trajectory

@@ -1,19 +1,19 @@
 """How large a force do 560 faults in the running station display to the operator?
 
-`python benchmarks/faults.py [--json FILE] [--each N]`. The tool presses on a leaf, the hand feels
-1 to 1.5 N and moves by 4 mm. Into ten stations, all methods and no channel at all, faults come at
-a random time, of random length (one sample to 0.35 s) and size, the same with every run: numbers
-that are none or far too large, samples that freeze or bear a wrong time, a sensor that saturates,
-packets that are lost, late or out of order, a load estimate that goes wrong, scales that are
-changed. Of each the force at the hand, at 2 kHz, has to be
+`python benchmarks/faults.py [--json FILE] [--each N]`. The tool presses on a leaf; the displayed
+force is 1 to 1.5 N, and the hand moves by 4 mm. Ten stations have all methods, or no channel.
+Faults come at a random time, with random length (one sample to 0.35 s) and size, the same in every
+run. Numbers are not finite or far too large; samples freeze or have a wrong time; a sensor
+saturates; packets are lost, late or out of order; the load estimate is wrong; scales change. The
+force at the hand, at 2 kHz, must be
 
-- finite, and within what the device displays (37.5 N);
+- finite, and within the device's peak force (37.5 N);
 - without a step above 0.5 N from one sample to the next;
-- zero from `channel.timeout` (0.1 s) and 50 ms after the fault's begin to its end, if it leaves the
-  station without a wrench for the hand.
+- zero from `channel.timeout` (0.1 s) and 50 ms after the beginning of the fault until its end, if
+  the fault leaves the station without a wrench for the hand.
 
-Not among them: a command that is no pose for longer than a sample, without a channel. There nobody
-remembers where the slave was sent, and it goes where it is sent next as fast as it can.
+One fault is excluded: without a channel, a command that is not a pose for more than one sample. No
+block stores the last command there, and the slave moves to the next command as fast as it can.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ Array = NDArray[np.float64]
 Change = Callable[[Array, float], None]
 
 STATIONS = ("no channel", *METHODS)
-BEFORE, END = 0.6, 1.25  # s: all runs of a station are one until then, and end there
+BEFORE, END = 0.6, 1.25  # s, common start of all runs of a station, and their end
 DELAY, TIMEOUT = 0.005, 0.1  # s
 STEP = 0.5  # N
-RANGE = 60.0  # N, of the sensor: so it saturates at what a hand still bears
-LATE = 2 * DELAY + 0.01  # s, for a packet there and back, and steps
+RANGE = 60.0  # N, range of the sensor: it saturates at a force that a hand can hold
+LATE = 2 * DELAY + 0.01  # s, delay of a packet for the round trip, and steps
 STATE = ("slave_plant", "arm_state")
-#: Wires (system, port, system) by what they carry.
+#: Wires (system, port, system) by their signal.
 PLACES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "sensor": ((*STATE, "wrist_sensor"),),
     "encoders": tuple(
@@ -85,7 +85,7 @@ CHANNEL_ONLY = ("pose", "hand")
 
 
 class Tap(LeafSystem):
-    """Passes on what comes, as `change` leaves it."""
+    """Block that passes on its input, changed by `change`."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ Taps = dict[str, list[Tap]]
 
 @contextmanager
 def _tapped() -> Iterator[Taps]:
-    """While it lasts, stations are built with a tap in each wire of `PLACES`."""
+    """Insert a tap into each wire of `PLACES` of stations that are built in this context."""
     taps: Taps = {place: [] for place in PLACES}
 
     class Builder(DiagramBuilder):
@@ -136,7 +136,7 @@ def _tapped() -> Iterator[Taps]:
 
 
 def pressing(name: str, trace: Path | None = None) -> Scenario:
-    """The scenario of one of `STATIONS`, over a recorded line if there is a `trace`."""
+    """Return the scenario of one of `STATIONS`, with the delays of `trace` if it is given."""
     scenario = replace(
         LoadScenario("contact_transition"),
         simulation__settle=0.0,
@@ -158,7 +158,7 @@ def pressing(name: str, trace: Path | None = None) -> Scenario:
 
 
 def tapped_station(scenario: Scenario) -> tuple[Diagram, Taps]:
-    """The station, with the load as it is, and its taps by `PLACES`."""
+    """Return the station with its true load, and its taps by `PLACES`."""
     load = true_load(scenario)
     load[:6] = scenario.wrist_sensor.offset
     with _tapped() as taps:
@@ -167,14 +167,14 @@ def tapped_station(scenario: Scenario) -> tuple[Diagram, Taps]:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong, where, when, and by how much.
+    """Fault with its place, time and size.
 
     Args:
-        kind: of `KINDS`.
-        place: of `PLACES`; empty for what has none.
+        kind: one of `KINDS`.
+        place: one of `PLACES`; empty for faults without a place.
         start, length: [s].
-        index: which number.
-        size: of what is wrong, in the kind's own unit.
+        index: number of the component.
+        size: in the unit of the kind.
     """
 
     kind: str
@@ -186,21 +186,21 @@ class Fault:
 
     @property
     def end(self) -> float:
-        """When it is over [s]."""
+        """Time of the end [s]."""
         return self.start + self.length
 
     @property
     def blinds(self) -> bool:
-        """Whether the station has no wrench for the hand while it lasts."""
+        """Whether the station has no wrench for the hand during the fault."""
         return self.kind not in ("saturated", "wrong load", "scales", "delayed", "out of order")
 
     def now(self, time: float) -> bool:
-        """Whether it lasts."""
+        """Return whether the fault is present."""
         return self.start - 1e-9 <= time < self.end - 1e-9
 
 
 def draw(kind: str, direct: bool, rng: np.random.Generator) -> Fault:
-    """A fault of that kind."""
+    """Return a random fault of that kind."""
     places = {
         "nan": [p for p in PLACES if not (direct and p in CHANNEL_ONLY)],
         "spike": ["sample", "load", "wrench", "command"] + ([] if direct else [*CHANNEL_ONLY]),
@@ -228,7 +228,7 @@ def draw(kind: str, direct: bool, rng: np.random.Generator) -> Fault:
     return Fault(kind, place, start, length, index, float(sizes.get(kind, 0.0)))
 
 
-#: How many of each among those of a station, of 56; without a channel there is no network.
+#: Number of each kind among the 56 faults of a station; without a channel there is no network.
 KINDS = {
     "nan": 18, "spike": 10, "frozen": 5, "clock": 4, "saturated": 3, "wrong load": 3, "scales": 3,
     "lost": 4, "delayed": 3, "out of order": 3,
@@ -237,14 +237,14 @@ NETWORK = ("lost", "delayed", "out of order")
 
 
 def change_of(fault: Fault, station: Diagram) -> Change:
-    """What the fault does to the numbers on its wires."""
+    """Return the function by which the fault changes the numbers on its wires."""
     held: list[Array] = []
     sensor = GetBlock(station, "wrist_sensor")
     offset = np.array(sensor.offset)
     limit = RANGE * fault.size
 
     def change(x: Array, time: float) -> None:
-        if fault.kind == "saturated":  # there and back, as quickly as a push grows
+        if fault.kind == "saturated":  # up and down, as quickly as a push grows
             u = np.clip(min(time - fault.start, fault.end - time) / 0.05, 0.0, 1.0)
             sensor.offset[:] = offset
             sensor.offset[fault.index % 3] += u * limit
@@ -264,7 +264,7 @@ def change_of(fault: Fault, station: Diagram) -> Change:
 
 
 def trace_of(fault: Fault, folder: Path) -> Path:
-    """A recorded line with the fault, for both directions."""
+    """Return the recorded delays of a network with the fault, for both directions."""
     late = f"{fault.size:.4f}"
     during = {"lost": "", "delayed": late, "out of order": late}[fault.kind]
     rows = [f"0,{DELAY}", f"{fault.start:.4f},{during}", f"{fault.end:.4f},{DELAY}", f"60,{DELAY}"]
@@ -278,7 +278,7 @@ def trace_of(fault: Fault, folder: Path) -> Path:
 
 
 class Running:
-    """A station that presses, from which each fault starts anew."""
+    """Station that presses; each fault starts from a copy of its state."""
 
     def __init__(self, name: str) -> None:
         self.scenario = pressing(name)
@@ -289,7 +289,7 @@ class Running:
         self._context = simulator.get_context().Clone()
 
     def run(self, fault: Fault) -> SimulationResult:
-        """From `BEFORE` on with the fault."""
+        """Simulate from `BEFORE` on with the fault."""
         simulator: Simulator = MakeSimulator(self.station, self.scenario.simulation)
         simulator.reset_context(self._context.Clone())
         simulator.Initialize(InitializeParams(suppress_initialization_events=True))
@@ -317,7 +317,7 @@ class Running:
 
 
 def over_the_network(name: str, fault: Fault) -> SimulationResult:
-    """The same over a line with the fault."""
+    """Simulate with the fault in the network."""
     with tempfile.TemporaryDirectory() as folder:
         scenario = pressing(name, trace_of(fault, Path(folder)))
         station, _ = tapped_station(scenario)
@@ -329,7 +329,7 @@ def over_the_network(name: str, fault: Fault) -> SimulationResult:
 
 @dataclass
 class Count:
-    """What was found of some faults: the largest force, step, and force while blind [N]."""
+    """Results of some faults: largest force, step, and force without a valid wrench [N]."""
 
     faults: int = 0
     largest: float = 0.0
@@ -343,11 +343,11 @@ class Count:
 
     @property
     def failed(self) -> int:
-        """How many assertions."""
+        """Number of failed criteria."""
         return self.not_finite + self.too_large + self.stepped + self.not_zero + self.raised
 
     def add(self, fault: Fault, result: SimulationResult | None) -> bool:
-        """Counts one; whether all was well."""
+        """Count one fault; return whether it met all criteria."""
         before = self.failed
         self.faults += 1
         if result is None:
@@ -357,7 +357,7 @@ class Count:
         felt, later = np.linalg.norm(force, axis=1), t > fault.start - 0.01
         largest = float(felt[later].max())
         step = float(np.linalg.norm(np.diff(force, axis=0), axis=1)[later[1:]].max())
-        # The sample is too old after half of the timeout; what was sent before is on its way.
+        # Samples are too old after half of the timeout, and earlier packets still arrive.
         blind = (t > fault.start + TIMEOUT + STOP_TIME_S + LATE) & (t < fault.end - 1e-3)
         left = float(felt[blind].max(initial=0.0)) if fault.blinds else 0.0
         self.not_finite += not np.isfinite(force).all()
@@ -370,7 +370,7 @@ class Count:
 
 
 def faults_of(name: str, each: int) -> list[Fault]:
-    """So many faults for a station, of all kinds, always the same."""
+    """Return `each` faults of all kinds for a station, the same in every run."""
     rng, direct = np.random.default_rng([2009, STATIONS.index(name)]), name == "no channel"
     kinds = {kind: n for kind, n in KINDS.items() if not (direct and kind in NETWORK)}
     total = sum(kinds.values())
@@ -381,9 +381,11 @@ def faults_of(name: str, each: int) -> list[Fault]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--each", type=int, default=56, help="faults for each station")
-    parser.add_argument("--station", choices=STATIONS, action="append", help="all by default")
+    parser.add_argument(
+        "--station", choices=STATIONS, action="append", help="station (default: all)"
+    )
     arguments = parser.parse_args()
     rows: dict[str, Count] = {}
     for name in arguments.station or STATIONS:

@@ -1,16 +1,16 @@
 """Is `analyze` as accurate for other arms and devices as for those of the paper?
 
-Vertically and with an ideal sensor, for an RX90 with a Phantom, a Panda with an omega.6 and a UR5
-with a Touch, sigma 0.5:
+Stations are vertical with an ideal sensor and sigma 0.5: an RX90 with a Phantom, a Panda with an
+omega.6 and a UR5 with a Touch. Compared are:
 
-* the sampled model of one axis against the two-port of the linearised Diagram, up to 20 Hz: the
-  largest difference of each entry, as part of the entry's largest magnitude;
-* the stiffest stable wall that `analyze` gives for each grip, against the nonlinear station: it
-  presses on that wall with a force scale of 0.9 and of 1.1 times the scenario's, and the motion of
-  the hand in a later second is divided by that in an earlier one; below 1 it dies out. The
-  dominant multiplier of the sampled axis predicts that ratio;
-* the slowest motion of the linearised Diagram, and how far tool and hand take part in it: of a
-  redundant arm it is the arm's own towards its posture.
+* the sampled model of one axis and the two-port of the linearised Diagram, up to 20 Hz: largest
+  difference of each entry, over the entry's largest magnitude;
+* the stiffest stable wall of `analyze` for each grip, and the nonlinear station: it presses on that
+  wall with 0.9 and 1.1 times the scenario's force scale. The motion of the hand in a later second,
+  over that in an earlier one, is below 1 if it decays. The dominant multiplier of the sampled
+  axis predicts that ratio;
+* the slowest motion of the linearised Diagram, and the share of tool and hand in it: a redundant
+  arm moves slowly towards its posture.
 
     python benchmarks/foreign_analysis.py [--arms rx90,panda,ur5] [--models DIR] [--json FILE]
 """
@@ -56,8 +56,8 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 DEVICES = {"rx90": "phantom_premium_15", "panda": "omega_6", "ur5": "geomagic_touch"}
 Array = Any
 _BAND = 2 * np.pi * 20.0
-_PRESS, _DEEPEST = 15.0, 5e-3  # N on the wall, the tip at most so deep in it [m]
-# Part of the force scale that is stable, when it changes [s], in which time; seconds to compare.
+_PRESS, _DEEPEST = 15.0, 5e-3  # N on the wall, and largest depth of the tip in it [m]
+# Stable share of the force scale; time of its change [s]; duration of the change; compared seconds.
 _BEFORE, _CHANGE, _CHANGING = 0.6, 1.6, 0.4
 _FIRST, _LAST, _SECOND = 2.1, 4.1, 1.0
 
@@ -66,9 +66,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(DEVICES))
     parser.add_argument(
-        "--models", type=Path, default=described(), help="example-robot-data/robots"
+        "--models", type=Path, default=described(), help="folder example-robot-data/robots"
     )
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     rows = {}
     for arm in arguments.arms.split(","):
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def station_of(arm: str, models: Path | None) -> Scenario:
-    """In free motion, at the device's own rate; without Coulomb friction."""
+    """Return a station in free motion at the device's rate, without Coulomb friction."""
     file, slave = ARMS[arm]
     if file:
         slave = dataclasses.replace(slave, model=str(models / file) if models else "")
@@ -134,9 +134,9 @@ def off(with_hand: Any, axis: OneAxis, sampling: Sampling) -> dict[str, float]:
 
 
 def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> float:
-    """Speed of the hand along z on a wall, in a late second over that in an early one.
+    """Return the hand's speed along z on a wall, in a late second over that in an early one.
 
-    The force scale goes over from where it is stable to `share` of the scenario's.
+    The force scale ramps from a stable value to `share` of the scenario's.
     """
     tip, ball = NominalSlave(scenario.slave).start_tip, 4e5  # N/m, in series
     wall = Wall(
@@ -180,7 +180,7 @@ def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> fl
 
 
 def predicted(axis: OneAxis, stiffness: float, share: float, sampling: Sampling) -> float:
-    """The same of one axis, of what dies last."""
+    """Return that ratio for the slowest motion of one axis."""
     scale = share * axis.force_scale
     loop = cut_loop(
         dataclasses.replace(axis, wall_stiffness=stiffness, force_scale=scale), sampling
@@ -190,7 +190,7 @@ def predicted(axis: OneAxis, stiffness: float, share: float, sampling: Sampling)
 
 
 def slowest(scenario: Scenario, system: Linearization) -> dict[str, float]:
-    """Of what dies last: how soon it halves, and speeds of tool and hand over the joints'."""
+    """Return half-life of the slowest motion, and speeds of tool and hand over the joints'."""
     slave, n = NominalSlave(scenario.slave), slave_arm(scenario).num_joints
     values, vectors = np.linalg.eig(system.A)
     k = int(np.argmax(np.abs(values)))

@@ -1,10 +1,10 @@
 """How much does a user type from a file of each usual format to the mass and the contact force?
 
-`python benchmarks/formats.py [--only PATTERN] [--seeds 1] [--json FILE]` writes the
-same recording, 30 s at 100 Hz with two pushes, as 18 programs write it: their names, units, axes
-and files. `inspect` drafts a description, and `detect` of that draft, with the words of YAML that
-the row states, gives the load and the contact force. Errors are against the truth: of the mass, and
-the rms of the contact force over that of the noise.
+`python benchmarks/formats.py [--only PATTERN] [--seeds 1] [--json FILE]` writes the same recording,
+30 s at 100 Hz with two pushes, in the names, units, axes and files of 18 programs. `inspect` drafts
+a description; the user adds the words of YAML in the row; `detect` gives the load and the contact
+force. Errors are against the truth: of the mass, and the rms of the contact force over that of the
+noise.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Files = list[Path]
 
 @dataclass(frozen=True)
 class Recording:
-    """Times, pose of S in the base, wrench that the load exerts on the sensor, and the truth."""
+    """Times, pose of S in the base, wrench of the load on the sensor, and the truth."""
 
     t: Array
     position: Array
@@ -50,7 +50,7 @@ class Recording:
         return np.asarray(self.rotation.as_quat(canonical=False))
 
     def columns(self, names: str, *parts: Array) -> pl.DataFrame:
-        """Return a table with the names, separated by spaces, of the parts' columns."""
+        """Return a table; `names` are those of the parts' columns, separated by spaces."""
         values = np.column_stack([self.t, *parts])
         return pl.DataFrame(values, schema=names.split(), orient="row")
 
@@ -76,7 +76,7 @@ def record(seed: int) -> Recording:
 
 
 def _plotjuggler(r: Recording, folder: Path) -> Files:
-    """Two topics in one table, with empty cells."""
+    """Write two topics in one table, with empty cells."""
     force = "/ft/wrench/force/x /ft/wrench/force/y /ft/wrench/force/z"
     torque = force.replace("force", "torque")
     pose = "/pose/pose/position/x /pose/pose/position/y /pose/pose/position/z"
@@ -90,7 +90,7 @@ def _plotjuggler(r: Recording, folder: Path) -> Files:
 
 
 def _ur(r: Recording, folder: Path) -> Files:
-    """Rotation vector; the wrench of the sensor, `ft_raw_wrench`."""
+    """Write rotation vectors, and the wrench of the sensor, `ft_raw_wrench`."""
     names = ["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))]
     names += [f"ft_raw_wrench_{k}" for k in range(6)]
     rotvec = r.rotation.as_rotvec()
@@ -99,7 +99,7 @@ def _ur(r: Recording, folder: Path) -> Files:
 
 
 def _xarm(r: Recording, folder: Path) -> Files:
-    """Millimetres, and roll, pitch and yaw about fixed axes in degrees."""
+    """Write millimetres, and roll, pitch and yaw about fixed axes in degrees."""
     names = "time x y z roll pitch yaw " + " ".join(f"ft_raw_{k}" for k in range(6))
     rpy = r.rotation.as_euler("xyz", degrees=True)
     r.columns(names, 1e3 * r.position, rpy, r.wrench).write_csv(folder / "xarm.csv")
@@ -107,7 +107,7 @@ def _xarm(r: Recording, folder: Path) -> Files:
 
 
 def _kuka(r: Recording, folder: Path) -> Files:
-    """Millimetres, A B C (about z, y and x) in degrees, tabs, time in ms."""
+    """Write millimetres, A B C (about z, y and x) in degrees, tabs, time in ms."""
     names = "Zeit X Y Z A B C Fx Fy Fz Tx Ty Tz"
     abc = r.rotation.as_euler("ZYX", degrees=True)
     table = r.columns(names, 1e3 * r.position, abc, r.wrench)
@@ -116,7 +116,7 @@ def _kuka(r: Recording, folder: Path) -> Files:
 
 
 def _abb(r: Recording, folder: Path) -> Files:
-    """Millimetres, numbered quaternions with w first, time in ms."""
+    """Write millimetres, numbered quaternions with w first, time in ms."""
     names = "time_ms x y z q1 q2 q3 q4 Fx Fy Fz Tx Ty Tz"
     q = np.roll(r.xyzw, 1, axis=1)
     table = r.columns(names, 1e3 * r.position, q, r.wrench)
@@ -125,7 +125,7 @@ def _abb(r: Recording, folder: Path) -> Files:
 
 
 def _fanuc(r: Recording, folder: Path) -> Files:
-    """Millimetres, W P R about fixed x, y and z in degrees, in a spreadsheet."""
+    """Write millimetres, W P R about fixed x, y and z in degrees, in a spreadsheet."""
     names = "Time X Y Z W P R Fx Fy Fz Mx My Mz"
     wpr = r.rotation.as_euler("xyz", degrees=True)
     r.columns(names, 1e3 * r.position, wpr, r.wrench).write_excel(folder / "fanuc.xlsx")
@@ -133,7 +133,7 @@ def _fanuc(r: Recording, folder: Path) -> Files:
 
 
 def _german(r: Recording, folder: Path) -> Files:
-    """Semicolons and decimal commas, as a spreadsheet exports them."""
+    """Write semicolons and decimal commas, as German spreadsheets do."""
     names = "Zeit_s x_mm y_mm z_mm qx qy qz qw Fx_N Fy_N Fz_N Mx_Nm My_Nm Mz_Nm"
     table = r.columns(names, 1e3 * r.position, r.xyzw, r.wrench)
     table.write_csv(folder / "export.csv", separator=";", decimal_comma=True)
@@ -141,7 +141,7 @@ def _german(r: Recording, folder: Path) -> Files:
 
 
 def _tum(r: Recording, folder: Path) -> Files:
-    """A trajectory `timestamp tx ty tz qx qy qz qw`, and a table of the sensor."""
+    """Write a trajectory `timestamp tx ty tz qx qy qz qw`, and a table of the sensor."""
     pose = r.columns("timestamp tx ty tz qx qy qz qw", r.position, r.xyzw)
     pose.write_csv(folder / "pose.csv")
     r.columns("timestamp fx fy fz tx ty tz", r.wrench).write_csv(folder / "ft.csv")
@@ -149,7 +149,7 @@ def _tum(r: Recording, folder: Path) -> Files:
 
 
 def _counts(r: Recording, folder: Path) -> Files:
-    """Integers: 1e4 per N and 1e5 per N m."""
+    """Write integers: 1e4 per N and 1e5 per N m."""
     names = "time x y z qx qy qz qw Fx Fy Fz Tx Ty Tz"
     counts = np.round(r.wrench * np.repeat([1e4, 1e5], 3))
     r.columns(names, r.position, r.xyzw, counts).write_csv(folder / "counts.csv")
@@ -169,7 +169,7 @@ def _lists(r: Recording) -> pl.DataFrame:
 
 
 def _lerobot(r: Recording, folder: Path) -> Files:
-    """One episode of a dataset: columns with lists."""
+    """Write one episode of a dataset: columns with lists."""
     _lists(r).write_parquet(folder / "episode_000000.parquet")
     return [folder / "episode_000000.parquet"]
 
@@ -189,20 +189,20 @@ def _structures(r: Recording) -> list[dict[str, Any]]:
 
 
 def _arrow(r: Recording, folder: Path) -> Files:
-    """Structures, as messages of ROS in a table."""
+    """Write structures, as messages of ROS in a table."""
     pl.DataFrame(_structures(r)).write_ipc(folder / "messages.arrow")
     return [folder / "messages.arrow"]
 
 
 def _json(r: Recording, folder: Path) -> Files:
-    """One JSON object per line."""
+    """Write one JSON object per line."""
     text = "\n".join(json.dumps(row) for row in _structures(r))
     (folder / "messages.jsonl").write_text(text + "\n", encoding="utf-8")
     return [folder / "messages.jsonl"]
 
 
 def _hdf5(r: Recording, folder: Path) -> Files:
-    """Arrays `obs/...` of one demonstration; quaternions without an order."""
+    """Write arrays `obs/...` of one demonstration; the order of quaternions is not stated."""
     import h5py
 
     with h5py.File(folder / "demo.hdf5", "w") as file:
@@ -213,7 +213,7 @@ def _hdf5(r: Recording, folder: Path) -> Files:
 
 
 def _zarr(r: Recording, folder: Path) -> Files:
-    """Arrays in a folder."""
+    """Write arrays in a folder."""
     import zarr
 
     group = zarr.open_group(folder / "demo.zarr", mode="w")
@@ -224,14 +224,14 @@ def _zarr(r: Recording, folder: Path) -> Files:
 
 
 def _npz(r: Recording, folder: Path) -> Files:
-    """Arrays of NumPy; the quaternions with w first."""
+    """Write arrays of NumPy; the quaternions have w first."""
     arrays = {"t": r.t, "ft": r.wrench, "pos": r.position, "quat": np.roll(r.xyzw, 1, axis=1)}
     np.savez(folder / "run.npz", **arrays)
     return [folder / "run.npz"]
 
 
 def _matlab(r: Recording, folder: Path) -> Files:
-    """Variables of MATLAB; rotation matrices by rows."""
+    """Write variables of MATLAB; rotation matrices by rows."""
     from scipy.io import savemat
 
     R = r.rotation.as_matrix().reshape(-1, 9)
@@ -272,12 +272,12 @@ def _bag(r: Recording, path: Path, storage: str) -> Files:
 
 
 def _mcap(r: Recording, folder: Path) -> Files:
-    """A bag of ROS 2 with WrenchStamped and PoseStamped."""
+    """Write a bag of ROS 2 with WrenchStamped and PoseStamped."""
     return _bag(r, folder / "run_mcap", "MCAP")
 
 
 def _sqlite(r: Recording, folder: Path) -> Files:
-    """The same in SQLite."""
+    """Write the same bag in SQLite."""
     return _bag(r, folder / "run_sqlite", "SQLITE3")
 
 
@@ -318,7 +318,7 @@ FORMATS = (
 
 
 def solved(form: Format, seed: int, folder: Path) -> dict[str, Any]:
-    """Return what the user types and gets: commands, words of YAML, and errors."""
+    """Return the user's input and its result: commands, words of YAML, and errors."""
     truth = record(seed)
     row: dict[str, Any] = {"format": form.name, "seed": seed, "commands": 2,
                            "words": len(form.edits)}  # fmt: skip
@@ -350,7 +350,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="*", help="pattern of the format's name")
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     rows = []
     for form in FORMATS:

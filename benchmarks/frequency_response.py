@@ -1,8 +1,8 @@
 """How well does the linearised Diagram predict the nonlinear station?
 
-A multi-sine is drawn by the operator, with all the sensor's noise, and measured responses are
-compared with those of the linearisation: vertically, in free motion for several sigma, and pressing
-on a leaf. The load is known exactly. Times are thread CPU time.
+The operator's intent is a multi-sine; the sensor has all its noise. Measured responses are compared
+with those of the linearisation: vertically, in free motion for several sigma, and pressing on a
+leaf. The load is known exactly. Times are thread CPU time.
 
     python benchmarks/frequency_response.py [--json FILE]
 """
@@ -35,7 +35,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 Array = NDArray[np.float64]
 
 _UP = (0.0, 0.0, 1.0)
-_GAP, _DEPTH = 0.03, 0.03  # m, from the tip to the leaf; how deep it is pressed
+_GAP, _DEPTH = 0.03, 0.03  # m, distance from tip to leaf; depth of the press
 _RATIOS = (
     ("hand_force", "hand_velocity"),
     ("felt_force", "hand_velocity"),
@@ -45,7 +45,7 @@ _RATIOS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
     for friction in (0.0, 1.0):
@@ -134,7 +134,7 @@ def _compared(
         figures[f"{name}: apparent mass, kg"] = response.apparent_mass()
     for output, input_ in _RATIOS:
         if output == "felt_force" and not reach and not scenario.force_scaling.sigma:
-            continue  # there is nothing to feel
+            continue  # without load there is no force
         ratio = response.response(output, input_) / predicted.response(output, input_)
         label = f"{name}: {output} / {input_}"
         figures[f"{label}, magnitude, %"] = 100 * np.abs(np.abs(ratio) - 1).max()
@@ -144,7 +144,7 @@ def _compared(
 
 
 def _approach(scenario: Scenario, reach: float) -> list[MinimumJerk]:
-    """So far that the hand's spring leaves it at `reach` [m]."""
+    """Return an intent that leaves the tip at `reach` [m] against the hand's spring."""
     if not reach or scenario.sheet_spring is None:
         return []
     force = scenario.force_scaling.force_scale * scenario.sheet_spring.stiffness * _DEPTH

@@ -1,23 +1,26 @@
 """Does every damaged file or option end in a result or in one error line?
 
-Feeds damaged inputs, made by grammar from good ones, to every reader (`fuzz_targets.py`,
-`fuzz_mutations.py`). A case is a finding if it raises anything but a DrakeTeleopError of one line
-of at most 1000 characters, if a warning or anything else reaches stderr, if it takes more than 5 s
-of CPU (or a minute in all) or more than 4 GB, or if its process dies.
+The fuzzer damages good inputs by grammar and passes them to every reader (`fuzz_targets.py`,
+`fuzz_mutations.py`). A case is a finding
+
+* if it raises anything but a DrakeTeleopError of one line of at most 1000 characters;
+* if a warning or other text reaches stderr;
+* if it takes more than 5 s of CPU (or a minute in all) or more than 4 GB;
+* if its process dies.
 
     python benchmarks/fuzz.py [--seconds 60] [--seed 0] [--only scenario,sdf] [--json FILE]
     python benchmarks/fuzz.py --replay FILE          # one case again, in this process
 
-Each finding is written to a folder, once for each place that it comes from, with the command that
-repeats it; the exit status is then 1. The cases of a target follow from the seed, one after the
-other; how many there are is a question of time.
+Each finding is written to a folder, once for each code line that raises it, with the command that
+repeats it; the exit status is then 1. The sequence of cases of a target depends only on the seed,
+their number on the time.
 
-Guided by coverage: of every fourth case the lines of the package that it reaches are noted, and
-what reaches a new one becomes an input to begin with. That is twenty lines here, and not a tool,
-for these reasons (2026): Atheris does not go on after an abort or a hang, which are to be counted,
-has no wheels for macOS and Python 3.10, and its changes of bytes do not get past a parser, so that
-the grammars would have to be written all the same; the targets of hypothesis are numbers that a
-test has to name, and its cases change from version to version.
+Coverage guides the choice of inputs: the lines of the package that every fourth case reaches are
+recorded, and a case that reaches a new line becomes an input for further cases. The fuzzer is not a
+published tool for these reasons (2026): Atheris does not continue after an abort or a hang, and has
+no wheels for macOS and Python 3.10. Its changes of bytes do not pass a parser, so that grammars
+would be necessary all the same. Hypothesis needs a test that names the numbers to maximise, and its
+cases change from version to version.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-if __name__ == "__main__":  # before libraries look
+if __name__ == "__main__":  # before libraries read it
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     os.environ |= {"POLARS_MAX_THREADS": "1"}
 
@@ -59,21 +62,23 @@ _PACKAGE = str(Path(drake_teleop.__file__).parent)
 _CPU_SECONDS, _SECONDS, _BYTES = 5.0, 60.0, 4 << 30
 _DEATHS = {signal.SIGPROF: f"more than {_CPU_SECONDS:g} s of CPU"}
 _DEATHS |= {signal.SIGALRM: f"more than {_SECONDS:g} s"}
-_TRACED = 4  # of so many cases one
-_LONGEST = 20_000  # bytes of a case that others may begin with, beyond those of the good inputs
+_TRACED = 4  # one case of this number is traced
+_LONGEST = 20_000  # bytes; longest case that becomes an input, beyond the length of the good inputs
 
 
 def main() -> None:
-    """Runs the targets at once, and reports."""
+    """Run the targets in parallel and report."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the whole run")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of the whole run [s]")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--only", default="", help="targets, with commas between them")
-    parser.add_argument("--cases", type=int, help="of each target, in place of --seconds")
-    parser.add_argument("--folder", type=Path, help="of findings; default: out/fuzz")
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--replay", type=Path, metavar="FILE", help="TARGET-anything.suffix")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel processes")
+    parser.add_argument("--only", default="", help="targets, separated by commas")
+    parser.add_argument("--cases", type=int, help="cases of each target, in place of --seconds")
+    parser.add_argument("--folder", type=Path, help="folder of findings (default: out/fuzz)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument(
+        "--replay", type=Path, metavar="FILE", help="file of a case, named TARGET-anything.suffix"
+    )
     arguments = parser.parse_args()
     if arguments.replay:
         replay(arguments.replay)
@@ -88,7 +93,7 @@ def main() -> None:
 
 
 def replay(path: Path) -> None:
-    """One case, named TARGET-anything, in this process, so that a debugger may look at it."""
+    """Run one case, named TARGET-anything, in this process, for use with a debugger."""
     target = target_of(path)
     with tempfile.TemporaryDirectory() as folder:
         target.seeds(Path(folder))
@@ -102,28 +107,28 @@ def replay(path: Path) -> None:
             print("no error")
 
 
-# One process: the cases of one target, one after the other.
+# One process: the cases of one target in sequence.
 
 
 @dataclass
 class State:
-    """How far a target has come; a process that takes over from a dead one begins with it."""
+    """Progress of a target; a process that replaces a dead one starts with it."""
 
     target: Target
     folder: Path
     seconds: float
-    counts: Any  # shared by the processes: cases, those that were refused, is one being made
+    counts: Any  # shared by the processes: cases, refused cases, whether a case is in preparation
     kept: list[bytes] = field(default_factory=list)
     lines: set[tuple[str, int]] = field(default_factory=set)
     findings: dict[str, Finding] = field(default_factory=dict)
 
     def keep(self, content: bytes, lines: set[tuple[str, int]]) -> None:
-        """Has one more input to begin with, which reached these lines."""
+        """Add an input that reached these lines."""
         self.kept.append(content)
         self.lines |= lines
 
     def find(self, content: bytes, place: str, what: str) -> None:
-        """Notes a finding: the shortest content of each place, and how often it was found."""
+        """Count a finding; keep the shortest content of each place."""
         finding = self.findings.setdefault(place, Finding(content, what))
         finding.times += 1
         if len(content) < len(finding.content):
@@ -132,7 +137,7 @@ class State:
 
 @dataclass
 class Finding:
-    """What is wrong, with the content that shows it."""
+    """Finding with its content."""
 
     content: bytes
     what: str
@@ -140,12 +145,12 @@ class Finding:
 
 
 def work(state: State, seed: int, most: float, pipe: Connection) -> None:
-    """Runs cases until the time is up; tells what is found at once, because it may die."""
+    """Run cases until the time is up; send findings at once, because the process may die."""
     end = time.monotonic() + state.seconds
     target, errors = state.target, _quiet(state.folder)
     case = state.folder / f"case{target.suffix}"
     good = target.seeds(state.folder)
-    for content in good:  # a good input is no finding, or all that follows means little
+    for content in good:  # good inputs must pass, otherwise the mutations mean little
         case.write_bytes(content)
         with _traced(state.lines):
             target.run(case)
@@ -156,13 +161,14 @@ def work(state: State, seed: int, most: float, pipe: Connection) -> None:
         rng = random.Random(f"{seed} {target.name} {state.counts[0]}")
         pool = state.kept if state.kept and rng.random() < 0.5 else good
         origin = rng.choice(pool)
-        # A process that dies while it makes a case leaves what it made it of, and goes on after it.
+        # If the process dies while it makes a case, the original is left, and the next process
+        # continues.
         case.write_bytes(origin)
         state.counts[0] += 1
         state.counts[2] = 1
         content = target.mutate(rng, origin, rng.choice(good))
         state.counts[2] = 0
-        os.ftruncate(errors, 0)  # what libraries say while a case is made
+        os.ftruncate(errors, 0)  # messages of libraries while a case is made
         case.write_bytes(content)
         lines: set[tuple[str, int]] = set()
         with _traced(lines) if state.counts[0] % _TRACED == 0 else nullcontext():
@@ -176,7 +182,7 @@ def work(state: State, seed: int, most: float, pipe: Connection) -> None:
 
 
 def _quiet(folder: Path) -> int:
-    """Sends what is printed to nowhere, and errors to a file, which it returns."""
+    """Discard the standard output, send errors to a file, and return the file."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     errors = os.open(folder / "stderr", os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
     for number, file in ((0, nowhere), (1, nowhere), (2, errors)):
@@ -199,7 +205,7 @@ def _limit_memory() -> None:
 
 @contextmanager
 def _traced(lines: set[tuple[str, int]]) -> Iterator[None]:
-    """Notes the lines of the package that are reached."""
+    """Record the lines of the package that are reached."""
 
     def in_function(frame: Any, event: str, _: Any) -> Any:
         lines.add((frame.f_code.co_filename, frame.f_lineno))
@@ -216,8 +222,8 @@ def _traced(lines: set[tuple[str, int]]) -> Iterator[None]:
 
 
 def _outcome(target: Target, case: Path, errors: int) -> tuple[str, ...]:
-    """("good",), ("refused",) by one line, or ("finding", place, what)."""
-    # The kernel ends a process that is late, wherever it is.
+    """Return ("good",), ("refused",) for one error line, or ("finding", place, what)."""
+    # The kernel ends a process that exceeds its time, in any state.
     signal.setitimer(signal.ITIMER_PROF, _CPU_SECONDS)
     signal.setitimer(signal.ITIMER_REAL, _SECONDS)
     outcome: tuple[str, ...] = ("good",)
@@ -241,17 +247,17 @@ def _outcome(target: Target, case: Path, errors: int) -> tuple[str, ...]:
 
 
 def _place(said: str) -> str:
-    """Of a traceback, the innermost line of the package."""
+    """Return the innermost line of the package in a traceback."""
     places = re.findall(rf'File "{re.escape(_PACKAGE)}/(.*)", line (\d+)', said)
-    in_order = places if "Traceback (" in said else places[::-1]  # faulthandler begins within
+    in_order = places if "Traceback (" in said else places[::-1]  # or innermost first
     return ":".join(in_order[-1]) if in_order else "somewhere"
 
 
-# All of them.
+# All targets.
 
 
 def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -> list[State]:
-    """Runs so many targets at once as there are processes, those with the largest share first."""
+    """Run as many targets in parallel as there are processes, the largest share first."""
     context = multiprocessing.get_context("fork")
     second = arguments.seconds * arguments.jobs / sum(target.share for target in targets)
     states = []
@@ -266,7 +272,7 @@ def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -
         while waiting or running:
             while waiting and len(running) < arguments.jobs:
                 state = waiting.pop(0)
-                shutil.rmtree(state.folder, ignore_errors=True)  # of a process that has died
+                shutil.rmtree(state.folder, ignore_errors=True)  # left by a process that died
                 state.folder.mkdir()
                 here, there = context.Pipe(duplex=False)
                 options = (state, arguments.seed, most, there)
@@ -294,11 +300,11 @@ def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -
 
 
 def _died(state: State, status: int) -> None:
-    """Notes the case at which a process has died."""
+    """Record the case at which a process died."""
     said = (state.folder / "stderr").read_text(errors="replace")
     if status < 0:
         name = _DEATHS.get(signal.Signals(-status), signal.Signals(-status).name)
-    else:  # a good input is refused, or the fuzzer has a mistake
+    else:  # a good input was refused, or the fuzzer has an error
         name, state.seconds = "the fuzzer", 0.0
     if state.counts[2]:
         name, state.counts[2] = f"{name} while a case was made of this one", 0
@@ -307,7 +313,7 @@ def _died(state: State, status: int) -> None:
 
 
 def report(states: list[State], folder: Path) -> dict[str, Any]:
-    """Prints counts and findings, and writes the latter."""
+    """Print counts and findings, and write the latter."""
     print(f"{'':14}{'cases':>8}{'results':>9}{'one line':>9}{'lines':>7}{'findings':>9}")
     for state in states:
         cases, refused, _ = state.counts

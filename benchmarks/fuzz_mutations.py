@@ -1,8 +1,9 @@
 """Damaged inputs for `fuzz.py`.
 
-Each function takes a generator of random numbers, the content and another content of the same kind
-to take parts from, and returns new content. The same numbers make the same content. Most changes
-keep the grammar, so that the readers behind the parser are reached; some are of bytes.
+Each function has as arguments a generator of random numbers, the content, and another content of
+the same kind as a source of parts; it returns new content. The same random numbers give the same
+content. Most changes keep the grammar, so that they reach the readers behind the parser; some
+change bytes.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def _nasty(rng: random.Random) -> str:
 
 
 def _near(rng: random.Random, number: str) -> str:
-    """A number that may stand in the place of another one; of a word the word."""
+    """Return a number that may replace another one; return a word unchanged."""
     try:
         return repr(float(number) * rng.choice((-1.0, 0.1, 0.5, 0.99, 2.0, 10.0)))
     except ValueError:
@@ -76,7 +77,7 @@ def _near(rng: random.Random, number: str) -> str:
 
 
 def damaged(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of any file: bytes changed, lost, doubled, exchanged with another file's."""
+    """Change, remove, repeat or exchange bytes of any file."""
     data = bytearray(content or b"\0")
     for _ in range(rng.choice((1, 1, 2, 5, 20))):
         at, size = rng.randrange(len(data) + 1), rng.choice((1, 1, 2, 4, 8, 64, 500))
@@ -101,7 +102,7 @@ def damaged(rng: random.Random, content: bytes, other: bytes) -> bytes:
 
 
 def text(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of a text: numbers, words and lines."""
+    """Change numbers, words and lines of a text."""
     for _ in range(rng.choice((1, 1, 2, 4))):
         content = rng.choice(_TEXT_EDITS)(rng, content, other)
     return content
@@ -161,7 +162,7 @@ _TEXT_EDITS += (_other_lines, _nested, damaged)
 
 
 def yaml_text(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of YAML: its nodes, tags and anchors; or its text."""
+    """Change nodes, tags and anchors of YAML, or its text."""
     root, more = _nodes(content), _nodes(other)
     if root is None or rng.random() < 0.3:
         return text(rng, content, other)
@@ -174,7 +175,7 @@ def yaml_text(rng: random.Random, content: bytes, other: bytes) -> bytes:
 
 
 def json_text(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of JSON: its values and names; or its text."""
+    """Change values and names of JSON, or its text."""
     root, more = _nodes(content), _nodes(other)
     if root is None or rng.random() < 0.3:
         return text(rng, content, other)
@@ -205,7 +206,7 @@ def _nodes(content: bytes) -> yaml.Node | None:
 
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_MOST_BRACKETS = 500  # for the parser in C, which the readers do not use
+_MOST_BRACKETS = 500  # for the C parser, which the readers do not use
 
 
 def _all_nodes(root: yaml.Node) -> list[yaml.Node]:
@@ -228,7 +229,7 @@ def _edit_node(rng: random.Random, root: yaml.Node, more: yaml.Node) -> None:
     nodes = _all_nodes(root)
     node = rng.choice(nodes)
     kind = rng.randrange(8)
-    if kind == 0:  # the same node at two places, perhaps inside itself
+    if kind == 0:  # the same node at two places, possibly inside itself
         _put(rng, root, node)
     elif kind == 1:
         node.tag = rng.choice(("!Touch", "!Press", "!", "!!", "tag:yaml.org,2002:int", "!x y", "?"))
@@ -260,7 +261,7 @@ def _edit_node(rng: random.Random, root: yaml.Node, more: yaml.Node) -> None:
 
 
 def _put(rng: random.Random, root: yaml.Node, new: yaml.Node) -> None:
-    """Replaces a value somewhere below the root."""
+    """Replace a random value below the root."""
     places = [node for node in _all_nodes(root) if node.value and not _is_scalar(node)]
     if places:
         node = rng.choice(places)
@@ -274,7 +275,7 @@ def _is_scalar(node: yaml.Node) -> bool:
 
 
 def xml(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of XML: elements, attributes, numbers; or its text."""
+    """Change elements, attributes and numbers of XML, or its text."""
     try:
         root, more = ElementTree.fromstring(content), ElementTree.fromstring(other)
     except (ElementTree.ParseError, ValueError):
@@ -312,7 +313,7 @@ def _edit_element(rng: random.Random, root: ElementTree.Element, more: ElementTr
 
 
 def _vector(rng: random.Random, value: str) -> str:
-    """A text with one of its numbers changed, lost or doubled."""
+    """Change, remove or repeat one of the numbers in a text."""
     parts = value.split() or [""]
     at = rng.randrange(len(parts))
     new = ([_near(rng, parts[at])], [_nasty(rng)], [_nasty(rng)], [], [parts[at]] * 2)
@@ -324,7 +325,7 @@ def _vector(rng: random.Random, value: str) -> str:
 
 
 def table(suffix: str) -> Mutation:
-    """Of a table in a file of this suffix: its columns, cells and rows; or its bytes."""
+    """Change columns, cells and rows of a table in a file of this suffix, or its bytes."""
 
     def mutated(rng: random.Random, content: bytes, other: bytes) -> bytes:
         damage = text if suffix == ".csv" else damaged
@@ -337,7 +338,7 @@ def table(suffix: str) -> Mutation:
                 for _ in range(rng.choice((1, 1, 2, 3))):
                     rng.choice(_TABLE_EDITS)(rng, columns)
             return encoded(suffix, columns)
-        # What the libraries cannot read or write, in whatever way, is left to the other one.
+        # Tables that the libraries cannot read or write are damaged as bytes.
         except (Exception, polars.exceptions.PanicException):
             return damage(rng, content, other)
 
@@ -345,7 +346,7 @@ def table(suffix: str) -> Mutation:
 
 
 def decoded(suffix: str, content: bytes) -> dict[str, np.ndarray]:
-    """The columns of a table by their names."""
+    """Return the columns of a table by their names."""
     if suffix == ".npz":
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -358,13 +359,13 @@ def decoded(suffix: str, content: bytes) -> dict[str, np.ndarray]:
 
 
 def read_parquet(content: io.BytesIO) -> polars.DataFrame:
-    """A table, or an exception: damaged content would end the process in polars."""
+    """Return a table, or raise an exception: damaged content would abort polars."""
     check_parquet_content(content.getvalue())
     return polars.read_parquet(content)
 
 
 def encoded(suffix: str, columns: dict[str, np.ndarray]) -> bytes:
-    """A table as a file of this suffix; what has no such form raises what it likes."""
+    """Return a table as a file of this suffix, or raise an exception if it has no such form."""
     stream = io.BytesIO()
     if suffix == ".npz":
         np.savez(stream, **columns)
@@ -478,7 +479,7 @@ _TABLE_EDITS = (_plant, _plant, _change, _change, _rows, _names, _types)
 
 
 def arguments(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of a command line: its words."""
+    """Change the words of a command line."""
     words, more = json.loads(content), json.loads(other)
     for _ in range(rng.choice((1, 1, 2, 3))):
         at, kind = rng.randrange(len(words) + 1), rng.randrange(7)

@@ -1,7 +1,7 @@
 """Inputs of `fuzz.py` for names, included files and recordings.
 
 Each case is JSON. A case is good if the result has the property that the target names, or if a
-DrakeTeleopError of one line is raised and nothing remains.
+DrakeTeleopError of one line is raised and no file remains.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ _STAMPS = ([[0.0, 800], [1e6, 1], [4.0, 300]], [[10.0, 60], [5.0, 700], [1e300, 
 
 
 def json_seeds(*cases: Any) -> Callable[[Path], list[bytes]]:
-    """Good inputs of a target."""
+    """Return a function that makes the good inputs of a target."""
     return lambda _: [json.dumps(case).encode() for case in cases]
 
 
 def _fields(path: Path, **defaults: Any) -> list[Any]:
-    """The fields of a case; the defaults where a mutation has made another type of them."""
+    """Return the fields of a case, or the default where a mutation has changed the type."""
     data = read_json(path)
     found = data if isinstance(data, dict) else {}
     return [
@@ -83,7 +83,7 @@ _PLAN: list[new_station.StationPlan] = []
 
 
 def name_mutation(rng: random.Random, content: bytes, _: bytes) -> bytes:
-    """Other names, of what YAML and files take in several ways."""
+    """Return other names, which YAML and file systems interpret in several ways."""
     words = [
         *mutations.WORDS,
         *mutations.NUMBERS,
@@ -101,12 +101,12 @@ def name_mutation(rng: random.Random, content: bytes, _: bytes) -> bytes:
 
 
 def new(path: Path) -> None:
-    """The station names these files, or nothing is left."""
+    """Check that the station refers to these files, or that no file is left."""
     arm, frame, package = _fields(path, arm="arm", frame="sensor", package="p")
     original = models_dir() / "rx90.sdf"
     if not _PLAN:
         _PLAN.append(new_station.plan_station(original, "sensor"))
-        new_station.plan_station = lambda *_: _PLAN[0]  # which takes longer than all the rest
+        new_station.plan_station = lambda *_: _PLAN[0]  # planning takes longer than all the rest
         new_station.run_command = lambda *_, **__: {}
         new_station.write_picture = lambda *_: None
     with tempfile.TemporaryDirectory() as folder, suppress(OSError, ValueError):
@@ -175,7 +175,7 @@ _NAMED = ("a.sdf", "b.sdf", "a.xml", "b.xml", "b.dmd.yaml", "x.gltf", "x.obj", "
 
 
 def include_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Other addresses; texts damaged; a file more of another model."""
+    """Change addresses, damage texts, or add a file of another model."""
     files = json.loads(content) | (json.loads(other) if rng.random() < 0.2 else {})
     for name, text in files.items():
         places = [old for old in _NAMED if old in text]
@@ -188,7 +188,7 @@ def include_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
 
 
 def model(path: Path) -> None:
-    """No body and no byte of a file outside is in the plant or the page."""
+    """Check that neither plant nor page contains bodies or bytes of files outside the folder."""
     files = {name: text for name, text in read_json(path).items() if isinstance(text, str)}
     with tempfile.TemporaryDirectory() as outside:
         folder = Path(outside, "model")
@@ -202,7 +202,7 @@ def model(path: Path) -> None:
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         first = folder / next(iter(files), "a.sdf")
         ParseModel(plant, first, "l")
-        logging.getLogger("drake").setLevel(logging.ERROR)  # of textures that are not there
+        logging.getLogger("drake").setLevel(logging.ERROR)  # of missing textures
         with translate_drake_errors(first):
             plant.Finalize()
             meshcat = Meshcat(MeshcatParams(host="localhost"))
@@ -225,7 +225,7 @@ stamps = json_seeds(*({"parts": parts, "step": 5e-3} for parts in _STAMPS))
 
 
 def recorded(path: Path) -> None:
-    """The longest run of readings on one clock is kept, but for a second at its start."""
+    """Check that the longest run of readings on one clock is kept, except for its first second."""
     parts, step = _fields(path, parts=_STAMPS[0], step=5e-3)
     step = min(max(abs(step), 1e-4), 0.9) if np.isfinite(step) else 5e-3
     recorder, longest = ReadingRecorder(), 0.0
@@ -245,7 +245,7 @@ sizes = json_seeds(*({"room": 10**6, "rows": 90, "name": name} for name in ("x.c
 
 
 def full_disk(path: Path) -> None:
-    """What was written before the disk was full is whole: each row, in order."""
+    """Check that the rows that were written before the disk was full are complete and in order."""
     room, rows, name = _fields(path, room=4096, rows=100, name="x.csv")
     room, rows = min(max(abs(room), 4096), 10**6), min(abs(rows), 1000)
     target = path.parent / "disk"
@@ -269,7 +269,7 @@ def full_disk(path: Path) -> None:
 
 
 def _limit(folder: Path, room: int, last: ExitStack) -> None:
-    """A tmpfs, if it may be mounted; else no file grows beyond the room."""
+    """Mount a tmpfs if possible; otherwise limit the size of each file."""
     mount = ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", str(folder)]
     if os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0:
         last.callback(subprocess.run, ["umount", "-l", str(folder)])
@@ -292,7 +292,7 @@ delays = json_seeds(*({"microseconds": 10**k} for k in (2, 3, 4)))
 
 
 def killed(path: Path) -> None:
-    """A drive that is killed at any time has all of its inputs up to then, or never began."""
+    """Check that a drive that is killed at any time has all its inputs up to then, or is absent."""
     (microseconds,) = _fields(path, microseconds=1000)
     folder, scenario = path.parent / "drive", Scenario()
     shutil.rmtree(folder, ignore_errors=True)

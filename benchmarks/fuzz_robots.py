@@ -1,7 +1,7 @@
 """Inputs of `fuzz.py` for the sources of `compensate`: records, samples, messages.
 
-A case is what a device sends, one after another. Whatever comes, what goes out of the loop has to
-be finite, within the sensor's range, and zero if it is flagged.
+A case is a sequence of a device's packets. The output of the loop must always be finite, within the
+sensor's range, and zero if it is flagged.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ _SENT, _FRAMES = 33, ("base", "tool0")
 
 
 def records(_: Path) -> list[bytes]:
-    """Of RDT."""
+    """Return records of RDT."""
     counts = [round(1000 * x) for x in _WRENCH]
     return [b"".join(RECORD_FORMAT.pack(k, 7 * k, 0, *counts) for k in range(COUNT))]
 
 
 def samples(_: Path) -> list[bytes]:
-    """Of RTDE."""
+    """Return samples of RTDE."""
     pose, gravity = (0.4, 0.1, 0.3, 0.1, 0.2, 0.3), (0.0, 0.0, 9.81)
     rows = [(100.0 + DT * k, *_WRENCH, *pose, *gravity) for k in range(COUNT)]
     return [b"".join(SAMPLE_FORMAT.pack(*row) for row in rows)]
 
 
 def messages(_: Path) -> list[bytes]:
-    """Of ROS 2, each with its attachment."""
+    """Return messages of ROS 2, each with its attachment."""
     return [
         b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPE_OF_TOPIC)
     ]
@@ -99,7 +99,7 @@ class _Told:
 
 
 def netft_wrenches(path: Path) -> None:
-    """Records of RDT, and an IMU that is well."""
+    """Check the loop's outputs for records of RDT and a valid IMU."""
     source = NetFtSource("netft://127.0.0.1?counts=1000,1000&rate=500", None)
     still = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0])
 
@@ -113,7 +113,7 @@ def netft_wrenches(path: Path) -> None:
 
 
 def rtde_wrenches(path: Path) -> None:
-    """Samples of RTDE."""
+    """Check the loop's outputs for samples of RTDE."""
     whole = [
         each
         for each in _pieces(path.read_bytes(), SAMPLE_FORMAT.size)
@@ -130,7 +130,7 @@ _MESSAGES = CdrConverter(-1.0, _FRAMES, _JOINTS)
 
 
 def ros_wrenches(path: Path) -> None:
-    """Messages of ROS 2; the poses are those of both topics."""
+    """Check the loop's outputs for messages of ROS 2, with poses from both topics."""
     content, parts = path.read_bytes(), []
     while content:
         for name, size in _SIZES.items():

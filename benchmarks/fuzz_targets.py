@@ -1,7 +1,7 @@
 """Targets of `fuzz.py`: readers of user files, and options (long: all of them).
 
-A target has good inputs to begin with, a way to damage them, and what is done with the result. A
-case is good if that returns, or raises a DrakeTeleopError of one line.
+A target has good inputs, a mutation, and a function that uses the result. A case is good if that
+function returns, or raises a DrakeTeleopError of one line.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ _AXES = [f"{group}_{axis}" for group in ("f", "tau", "s", "omega", "alpha") for 
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A reader.
+    """Reader with its inputs.
 
     Args:
         name: of the target.
         suffix: of its files.
         share: of the time.
-        seeds: makes good inputs, and in the folder it is given what they refer to.
-        mutate: makes a case of one.
+        seeds: returns good inputs, and writes the files that they refer to into the given folder.
+        mutate: makes a case of a good input.
         run: reads the file.
     """
 
@@ -103,7 +103,7 @@ def _scenario(path: Path) -> None:
 
 
 class _Enough(Exception):
-    """Ends a command before it runs anything."""
+    """Exception that ends a command before it runs."""
 
 
 def _study(path: Path) -> None:
@@ -161,7 +161,7 @@ def _trajectory(path: Path) -> None:
 
 
 def columns(count: int = 80) -> dict[str, np.ndarray]:
-    """A canonical log with a pose: `count` samples of a load that is turned and shaken."""
+    """Return a canonical log with a pose: `count` samples of a load that rotates and shakes."""
     t = 0.01 * np.arange(count)
     phases = np.outer(t, 2 * np.pi * np.array([0.9, 1.7, 2.3]))
     angles, rates = np.sin(phases), 2 * np.pi * np.array([0.9, 1.7, 2.3])
@@ -261,7 +261,7 @@ def _bags(suffix: str) -> Callable[[Path], list[bytes]]:
 
 
 def _write_bag(path: Path, suffix: str) -> Path:
-    """Wrenches, an IMU and transforms, 30 messages each: in a file, or of ROS 2 in a folder."""
+    """Write wrenches, an IMU and transforms, 30 messages each, as a file or a ROS 2 folder."""
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
@@ -306,7 +306,7 @@ def _messages(types: Any, old: bool) -> Any:
         yield "/imu", kind["Imu"], new("Imu", header, turn, nine - 1, rates, nine, specific, nine)
         place = new("Transform", new("Vector3", *w[:3]), turn)
         tool = new("TransformStamped", header, "tool0", place)
-        if old:  # whose types have no TFMessage
+        if old:  # its types have no TFMessage
             yield "/tool", kind["TransformStamped"], tool
         else:
             yield "/tf", kind["TFMessage"], new("TFMessage", [tool, tool])
@@ -333,7 +333,7 @@ def _results(_: Path) -> list[bytes]:
 
 
 def _result_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
-    """Of a simulation's log: its columns with its own signals; or what they are called."""
+    """Change the columns of a simulation's log, also by its own signals, or their names."""
     if rng.random() < 0.4:
         return mutations.damaged(rng, content, other)
     try:
@@ -349,7 +349,7 @@ def _result_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
             stream, metadata={key: found[key]}
         )
         return stream.getvalue()
-    # What polars does not write is damaged as bytes.
+    # Tables that polars cannot write are damaged as bytes.
     except (Exception, pl.exceptions.PanicException):
         return mutations.damaged(rng, content, other)
 
@@ -475,7 +475,7 @@ def _exchanges(_: Path) -> list[bytes]:
 
 
 def _exchange(path: Path) -> None:
-    """Sends 60 packets through both lines; what is received is one of them, or what was before."""
+    """Send 60 packets through both lines; check that packets arrive unchanged."""
     data = read_json(path)
     known = data if isinstance(data, dict) else {}
     scenario = ScenarioFromData({"channel": known.get("channel", {})}, str(path))
@@ -509,7 +509,7 @@ _MESSAGES = (
 
 
 def _message(path: Path) -> None:
-    """What a page says: nothing that is not bounded comes of it, whatever it is."""
+    """Check that any message of a page gives only bounded values."""
     content = path.read_bytes()
     said = [parse_message(text) for text in (content, content.decode(errors="replace"))]
     for found in filter(None, said):
@@ -528,7 +528,7 @@ def _floats(value: Any) -> np.ndarray:
     return np.array([x if isinstance(x, (int, float)) else math.nan for x in numbers], float)
 
 
-# What a robot sends to `compensate`.
+# Packets of robots to `compensate`.
 
 
 def _readings() -> list[Reading]:
@@ -551,7 +551,7 @@ def _reading_lines(_: Path) -> list[bytes]:
 
 
 def _wrenches(path: Path) -> None:
-    """Whatever comes, what goes out is finite, and zero if it is flagged."""
+    """Check that all outputs are finite, and zero if they are flagged."""
     content, size = path.read_bytes(), udp.READING_FORMAT.size
     if path.suffix == ".bin":
         parts = [content[k : k + size] for k in range(0, len(content), size)]
@@ -602,7 +602,7 @@ _COMMANDS = (
 
 def _commands(_: Path) -> list[bytes]:
     for command in cli.cli.commands.values():
-        command.callback = lambda **_: None  # it is the options that are read here
+        command.callback = lambda **_: None  # only options are read here
     return [json.dumps(line.split()).encode() for line in _COMMANDS]
 
 
@@ -615,7 +615,7 @@ def _command_line(path: Path) -> None:
     refused = line.startswith("error: ") and len(line) <= MAX_ERROR_LINE_LENGTH and "\n" not in line
     if refused:
         raise DrakeTeleopError(line.removeprefix("error: "))
-    if line or status not in (None, 0, 2):  # 2: the help, for want of words
+    if line or status not in (None, 0, 2):  # 2: help text, if words are missing
         raise AssertionError(f"exit status {status}, said {line!r}")
 
 
@@ -691,5 +691,5 @@ TARGETS = (
 
 
 def target_of(path: Path) -> Target:
-    """The target of a case that is kept as TARGET-anything.suffix."""
+    """Return the target of a stored case, TARGET-anything.suffix."""
     return next(target for target in TARGETS if path.name.startswith(f"{target.name}-"))

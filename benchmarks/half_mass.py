@@ -1,11 +1,11 @@
 """Does the best (sigma_weight, sigma_inertia) move if accelerated masses are perceived as half?
 
 `python benchmarks/half_mass.py [--swings 40] [--json FILE]`: a hand swings the paper's device and
-tool, a contact force begins, and the operator's perception (`station.operator.perception`) notices
-it or not. Of random swings, the smallest noticed contact force at the tool [N], mean and 95 %
-interval of the mean, for shares of weight and inertia, and for an operator who perceives the
-rendered inertial force fully or by half. Also the ratio of the mass that acceleration shows to the
-mass that weight shows: 1 is consistent.
+tool, and a contact force begins. A model of perception (`station.operator.perception`) decides
+whether the operator notices it. The figure is the smallest noticed contact force at the tool [N]
+in random swings, mean and 95 % interval of the mean. It is given for shares of weight and inertia,
+and for an operator who perceives all or half of the rendered inertial force. Another figure is the
+ratio of the masses that acceleration and weight indicate: 1 is consistent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _END, _TOUCH, _WITHIN, _RISE = 4.0, 3.0, 0.3, 0.02  # s
 
 
 def swing(rng: np.random.Generator, t: Array) -> tuple[Array, Array]:
-    """(N, 3) velocity and acceleration of a hand."""
+    """Return velocity and acceleration (N, 3) of a hand."""
     w = 2 * np.pi * rng.uniform(0.3, 1.5, (3, 3))
     phase, size = rng.uniform(0, 2 * np.pi, (3, 3)), rng.uniform(0.02, 0.1, (3, 3))
     angle = t[:, None, None] * w + phase
@@ -41,7 +41,7 @@ def swing(rng: np.random.Generator, t: Array) -> tuple[Array, Array]:
 
 
 def noticed(t: Array, v: Array, free: Array, contact: float) -> bool:
-    """Whether a contact force [N, at the tool] against the motion is noticed in time."""
+    """Return whether a contact force [N, at the tool] against the motion is noticed in time."""
     way = v[np.searchsorted(t, _TOUCH)]
     rise = np.clip((t - _TOUCH) / _RISE, 0.0, 1.0)[:, None]
     force = free + _SCALE * contact * rise * way / np.linalg.norm(way)
@@ -50,7 +50,7 @@ def noticed(t: Array, v: Array, free: Array, contact: float) -> bool:
 
 
 def smallest(t: Array, v: Array, a: Array, weight: float, inertia: float) -> float:
-    """Smallest noticed contact force at the tool [N]."""
+    """Return the smallest noticed contact force at the tool [N]."""
     free = _DEVICE * a + _DAMPING * v + _SCALE * _TOOL * inertia * a
     free[:, 2] += _SCALE * _TOOL * weight * _G
     low, high = 0.05, 50.0
@@ -63,7 +63,7 @@ def smallest(t: Array, v: Array, a: Array, weight: float, inertia: float) -> flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--swings", type=int, default=40)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     asked = parser.parse_args()
     t = np.arange(round(_END * 500)) / 500
     swings = [swing(np.random.default_rng([k, 31]), t) for k in range(asked.swings)]

@@ -1,15 +1,15 @@
 """How fast is the load core, compared with other libraries?
 
-Every figure is a ratio of times of this one thread, taken in turns (the best of several), next to
-the time itself; results are compared before anything is timed.
+Every figure is a ratio of thread times, measured in turns (the best of several), next to the time
+itself. The results are compared before the timing.
 
 - V phi: one call for one sample, and for many at once, against pinocchio's body regressor.
 - One update with all six rows: compiled loop, and `update` from Python, against padasip's and
-  filterpy's and a plain numpy recursion; and recursive total least squares next to it.
-- A batch with offsets and covariance: against stacking [E V] and solving with numpy, which gives
-  the estimate alone, by lstsq and by the normal equations; with the peak memory of each.
-- The consistent load: against the same semidefinite program in cvxpy, with the same solver
-  (Clarabel), set up anew as for every new record, and the same problem solved again.
+  filterpy's and a plain numpy recursion; also recursive total least squares.
+- A batch with offsets and covariance: against stacking [E V] and solving with numpy by lstsq and by
+  the normal equations, which give the estimate alone; with the peak memory of each.
+- The consistent load: against the same semidefinite program in cvxpy with the same solver
+  (Clarabel), set up anew as for each new record, and with a repeated solution.
 
     pip install -e '.[bench]'
     OMP_NUM_THREADS=1 python benchmarks/identification.py [--json FILE] [--samples 1000000]
@@ -55,7 +55,7 @@ PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
 
 
 def samples(n: int, seed: int = 1) -> tuple[Array, Array, Array, Array]:
-    """(wrench, s, omega, alpha) of n samples of the load PHI with OFFSETS and NOISE."""
+    """Return (wrench, s, omega, alpha) of n samples of the load PHI with OFFSETS and NOISE."""
     rng = np.random.default_rng(seed)
     s, omega, alpha = (rng.normal(size=(n, 3)) * size for size in (8.0, 2.0, 15.0))
     wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS + NOISE * rng.normal(size=(n, 6))
@@ -63,9 +63,9 @@ def samples(n: int, seed: int = 1) -> tuple[Array, Array, Array, Array]:
 
 
 def best(functions: dict[str, Callable[[], Any]], rounds: int = 7) -> dict[str, float]:
-    """Shortest time of each [s], taken in turns; the first call of each is not counted.
+    """Return the shortest thread time of each [s], measured in turns after a first call.
 
-    Of the thread, which other programs on the machine do not lengthen.
+    Other programs on the machine do not affect thread times.
     """
     for function in functions.values():
         function()
@@ -86,7 +86,7 @@ def wrench_of_a_load() -> dict[str, float]:
     inertia = pin.Inertia.FromDynamicParameters(PHI[PIN_ORDER])
 
     def with_pinocchio(i: int) -> Array:
-        # Pinocchio's twist has no a - g of its own: its linear acceleration is spatial.
+        # Pinocchio's twist does not contain a - g: its linear acceleration is spatial.
         velocity = pin.Motion(np.zeros(3), omega[i])
         return pin.bodyRegressor(velocity, pin.Motion(s[i], alpha[i])) @ PHI[PIN_ORDER]
 
@@ -150,7 +150,7 @@ def recursive_update() -> dict[str, float]:
         return np.concatenate([estimator.offsets, estimator.phi])
 
     def total() -> None:
-        # Noise of s, omega and alpha; what it is makes no difference to the time.
+        # Noise of s, omega and alpha; its size does not affect the time.
         motion_std = np.repeat([0.05, 0.002, 1.0], 3)
         RecursiveTotalLeastSquares(NOISE, motion_std).update_samples(wrench, s, omega, alpha)
 
@@ -219,7 +219,7 @@ def recursive_update() -> dict[str, float]:
 
 
 def _stacked(s: Array, omega: Array, alpha: Array) -> Array:
-    """The whole matrix [E V] (6 N, 16), written with numpy alone."""
+    """Return the whole matrix [E V] (6 N, 16), by numpy alone."""
     n = len(s)
     A = np.zeros((n, 6, 16))
     A[:, :, :6] = np.eye(6)
@@ -253,12 +253,12 @@ def _stacked(s: Array, omega: Array, alpha: Array) -> Array:
 
 
 def _least_squares(wrench: Array, s: Array, omega: Array, alpha: Array) -> Array:
-    """What one writes without this library."""
+    """Solve by least squares, as code without this library does."""
     return np.linalg.lstsq(_stacked(s, omega, alpha), wrench.reshape(-1), rcond=None)[0]
 
 
 def _normal_equations(wrench: Array, s: Array, omega: Array, alpha: Array) -> Array:
-    """The same faster: the small system, still from the whole matrix."""
+    """Solve the normal equations, from the whole matrix."""
     A = _stacked(s, omega, alpha)
     return np.linalg.solve(A.T @ A, A.T @ wrench.reshape(-1))
 
@@ -272,7 +272,7 @@ _BATCH = {"chunked": _chunked, "stacked": _least_squares, "normal": _normal_equa
 
 
 def _memory_mb(name: str) -> float:
-    """VmRSS, the memory in use, or VmHWM, the most since the last reset; Linux only."""
+    """Return VmRSS, the memory in use, or VmHWM, the most since the last reset; Linux only."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(name):
             return float(line.split()[1]) / 1024.0
@@ -280,11 +280,11 @@ def _memory_mb(name: str) -> float:
 
 
 def _measured(name: str, n: int, answer: Any) -> None:
-    """In a process of its own: time, peak memory beyond the data, and the estimate."""
+    """Return time, peak memory beyond the data, and the estimate, in a separate process."""
     solve = _BATCH[name]
     solve(*samples(1000))
     data = samples(n)
-    Path("/proc/self/clear_refs").write_text("5")  # Resets VmHWM.
+    Path("/proc/self/clear_refs").write_text("5")  # This resets VmHWM.
     before = _memory_mb("VmRSS")
     start = time.thread_time()
     theta = solve(*data)
@@ -320,7 +320,7 @@ def batch(n: int) -> dict[str, float]:
 def consistent_load() -> dict[str, float]:
     import cvxpy
 
-    # Few noisy samples of a rod: least squares finds what no body can be.
+    # Few noisy samples of a rod: the result of least squares is physically impossible.
     rod = phi_from_mass_com_inertia(1.1, [0.0, 0.0, 0.2], np.diag([0.02, 0.02, 1e-5]))
     _, s, omega, alpha = samples(60, seed=3)
     rng = np.random.default_rng(3)
@@ -358,7 +358,7 @@ def consistent_load() -> dict[str, float]:
     difference = abs(excess(ours()) - excess(theirs()))
     if difference > 1e-4 * abs(excess(ours())):
         raise SystemExit(f"cvxpy finds another minimum: {difference:.2g}")
-    # Between the turns of cvxpy, which leave the caches cold, and one after the other.
+    # Times between turns of cvxpy, with cold caches, and in sequence.
     times = best({"ours": ours, "again": theirs, "fresh": fresh}, rounds=50)
     alone = best({"ours": ours}, rounds=50)
     return {
@@ -371,8 +371,8 @@ def consistent_load() -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--samples", type=int, default=1_000_000, help="of the batch")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--samples", type=int, default=1_000_000, help="samples of the batch")
     arguments = parser.parse_args()
     figures: dict[str, float] = {"cores": float(os.cpu_count() or 0)}
     parts: list[Callable[[], dict[str, float]]] = [

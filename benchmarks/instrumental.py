@@ -35,9 +35,9 @@ INSTRUMENTS = slice(15, 24)  # motion from a second source, after the sample
 
 # Relative increase of M's diagonal against rounding.
 _RIDGE = 1e-9
-# Number of samples for which the specified wrench noise counts: first residuals are too small.
+# Number of samples with the specified wrench noise: first residuals are too small.
 _NOISE_SAMPLES = 20.0
-# Squared residual over squared wrench that is rounding.
+# Squared residual over squared wrench that counts as rounding.
 _ROUNDING_SQUARE = 1e-13
 
 

@@ -1,10 +1,11 @@
 """How often do the stated 95 % intervals contain the true load, for noise of any colour?
 
 `python benchmarks/intervals.py [--json FILE] [--seeds N]` identifies the same load N times (500)
-from the same motion with new noise of six colours, counts for each of the 16 parameters how often
-the interval of `uncertainty.confidence_intervals` holds the truth, and prints the table. With 500
-seeds the standard error of a count is 1 %. Then records that do not excite some parameters, in the
-same noise: how often each of these was called identified.
+from the same motion with new noise of six colours. For each of the 16 parameters it prints how
+often
+the interval of `uncertainty.confidence_intervals` contains the truth. With 500 seeds the standard
+error of this share is 1 %. Records that do not excite some parameters follow, in the same noise: it
+prints how often each of these parameters was called identified.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ SECONDS = 10.0
 
 
 def coloured_noise(rng: np.random.Generator, samples: int, colour: str) -> Array:
-    """(samples, 6) stationary noise of unit variance and one of `COLOURS`."""
+    """Return stationary noise (samples, 6) of unit variance and one of `COLOURS`."""
     rate, kind, number = COLOURS[colour]
     if kind == "ar":
         b, a = np.array([np.sqrt(1.0 - number**2)]), np.array([1.0, -number])
@@ -58,14 +59,14 @@ def coloured_noise(rng: np.random.Generator, samples: int, colour: str) -> Array
         b, a = butter(4, number, fs=rate)
         impulse = lfilter(b, a, np.eye(1, 4000)[0])
         b = b / np.sqrt(impulse @ impulse)
-    start = 1000  # the filters forget their start within
+    start = 1000  # after this, the filters have no effect of their start
     return np.asarray(lfilter(b, a, rng.normal(size=(start + samples, 6)), axis=0))[start:]
 
 
 def motion(rate: float, seconds: float = SECONDS, seed: int = 0) -> tuple[Array, Array, Array]:
-    """(s, omega, alpha), each (N, 3): roll, pitch and yaw by sines of 0.1 to 1 Hz in gravity.
+    """Return (s, omega, alpha), (N, 3) each, for sines of 0.1 to 1 Hz in all angles.
 
-    Angles of 1 rad, together 5 to 20 rad/s^2, and So accelerating by 2 m/s^2.
+    The angles are 1 rad, together 5 to 20 rad/s^2; So accelerates by 2 m/s^2.
     """
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate)) / rate
@@ -89,10 +90,10 @@ def motion(rate: float, seconds: float = SECONDS, seed: int = 0) -> tuple[Array,
 
 
 def coverage(colour: str, seeds: int, seconds: float = SECONDS) -> dict[str, Array]:
-    """How the intervals did in `seeds` noises of this colour.
+    """Return statistics of the intervals in `seeds` noises of this colour.
 
     Returns:
-        "coverage": (16,) shares of intervals that hold the truth; "identified": (16,) shares of
+        "coverage": (16,) shares of intervals that contain the truth; "identified": (16,) shares of
         records in which the parameter was called identified; "z": (16,) mean squared error over
         stated variance; "degrees": (16,) medians of the degrees of freedom.
     """
@@ -118,7 +119,7 @@ def coverage(colour: str, seeds: int, seconds: float = SECONDS) -> dict[str, Arr
 
 
 def unexcited_records() -> dict[str, tuple[tuple[Array, Array, Array], tuple[str, ...]]]:
-    """Name -> (motion, the parameters that it cannot tell)."""
+    """Return name -> (motion, parameters that it does not excite)."""
     inertia = PARAMETER_NAMES[10:]
     up = np.random.default_rng(1).normal(size=(24, 3))
     poses = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
@@ -138,7 +139,7 @@ def unexcited_records() -> dict[str, tuple[tuple[Array, Array, Array], tuple[str
 
 
 def false_verdicts(name: str, seeds: int) -> dict[str, int]:
-    """In how many of `seeds` records parameters without excitation were called identified.
+    """Return how often unexcited parameters were called identified, in `seeds` records.
 
     Returns:
         parameter without excitation -> count; AR(1) noise of 0.9.
@@ -156,9 +157,9 @@ def false_verdicts(name: str, seeds: int) -> dict[str, int]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the study and prints it; returns 0 if every share is within 90-98 %, 1 otherwise."""
+    """Run and print the study; return 0 if every share is within 90-98 %, 1 otherwise."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--seeds", type=int, default=500, help="records for each colour")
     options = parser.parse_args(arguments)
     shares = {colour: coverage(colour, options.seeds) for colour in COLOURS}

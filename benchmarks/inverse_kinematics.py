@@ -1,19 +1,20 @@
 """Does the inverse kinematics reach every pose, with bounded speed at singularities?
 
-`python benchmarks/inverse_kinematics.py [--poses 100000] [--json FILE]` takes the RX90, one with a
-sliding joint, one of five joints, one of eight, and of the `bench` extra's robot descriptions a
-Panda, an xArm 7, a UR5 and a Kinova Jaco. For each arm:
+`python benchmarks/inverse_kinematics.py [--poses 100000] [--json FILE]` tests the RX90, one with a
+sliding joint, arms of five and of eight joints, and from the robot descriptions of the extra
+`bench`
+a Panda, an xArm 7, a UR5 and a Kinova Jaco. For each arm:
 
 * `find_posture` for poses of random joint positions within the limits, from the middle of the
-  limits: how many are met, the largest error, the time; the status of those that are not;
-* `follow_pose` along a motion of all joints at 2 kHz, from its last answer: errors, the largest
-  speed as part of its limit, the time of a call. Baselines along the same motion: Drake's
-  `DoDifferentialInverseKinematics`, a step as of Pinocchio's examples, and one of damped least
+  limits: number of solutions, largest error, time; status of the others;
+* `follow_pose` along a motion of all joints at 2 kHz, from its previous solution: errors, largest
+  speed over its limit, time of a call. Baselines along the same motion: Drake's
+  `DoDifferentialInverseKinematics`, a step as in Pinocchio's examples, and a step of damped least
   squares in numpy;
-* of three, a tool that turns to and fro through a singularity of the wrist, or aside of it.
+* for three arms, a tool that rotates back and forth through a wrist singularity, or near it.
 
-And on the RX90, next to the closed form: the largest difference in a joint, and what the closed
-form does at the singularity. Time is of the thread.
+For the RX90 also: the largest joint difference to the closed form, and the behaviour of the closed
+form at the singularity. Times are thread times.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ from drake_teleop.station.slave.plant import ParseSlave, finalize_plant
 
 Array = Any
 PERIOD = 5e-4
-#: Of the package example-robot-data: file and frame.
+#: File and frame in the package example-robot-data.
 DESCRIBED = {
     "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
     "xarm7": ("xarm_description/urdf/xarm7.urdf", "link7"),
@@ -75,7 +76,7 @@ _JOINT = """<joint name="j{k}" type="{kind}"><parent link="l{i}"/><child link="l
 <origin xyz="{xyz}"/><axis xyz="{axis}"/><limit lower="{low}" upper="{high}" velocity="{speed}"
 effort="100"/></joint><link name="l{k}"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0"
 ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>"""
-#: A carriage on a rail of a metre, and six joints on it: kind, origin, axis, limits, speed.
+#: Carriage on a rail of one metre, with six joints on it: kind, origin, axis, limits, speed.
 _ON_A_RAIL = (
     ("prismatic", "0 0 0.3", "0 1 0", -0.5, 0.5, 0.5),
     ("revolute", "0 0 0.1", "0 0 1", -2.8, 2.8, 3.0),
@@ -85,7 +86,7 @@ _ON_A_RAIL = (
     ("revolute", "0 0 0.2", "0 1 0", -2.0, 2.0, 5.0),
     ("revolute", "0 0 0.1", "0 0 1", -3.1, 3.1, 5.0),
 )
-#: Five as of small arms, of which a pose that all reach asks for one of the six; and eight.
+#: Five joints as in small arms, whose reachable poses leave one of six coordinates free; and eight.
 _MADE = {
     "on a rail": _ON_A_RAIL,
     "five joints": (
@@ -104,7 +105,7 @@ _MADE = {
 
 
 def described() -> Path | None:
-    """The folder of the robot descriptions, if they are installed."""
+    """Return the folder of the robot descriptions, if they are installed."""
     try:
         files = distribution("example-robot-data").files or []
     except PackageNotFoundError:
@@ -153,7 +154,7 @@ def pose_of(arm: ArmModel, q: Array) -> Array:
 
 
 def errors(arm: ArmModel, pose: Array, q: Array) -> tuple[float, float]:
-    """[m], [rad]."""
+    """Return the errors [m], [rad]."""
     found = pose_of(arm, q)
     turn = (
         Rotation.from_quat(pose[:4], scalar_first=True)
@@ -182,7 +183,7 @@ def random_poses(arm: ArmModel, poses: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-#: Postures with the elbow well bent; the last but one joint is that which makes the wrist singular.
+#: Postures with the elbow well bent; the last joint but one causes the wrist singularity.
 BENT = {
     "rx90": (0.2, -0.5, -1.6, 0.7, 0.0, 0.4),
     "on a rail": (0.1, 0.3, 0.5, 1.4, 0.7, 0.0, 0.4),
@@ -192,7 +193,7 @@ ASIDE = (0.0, 1e-6, 1e-3, 0.03)
 
 
 class Follower:
-    """`follow_pose` as a station calls it."""
+    """Repeated calls of `follow_pose`, as in a station."""
 
     def __init__(self, arm: ArmModel, q: Array) -> None:
         self.arm, self.L, self.posture, self.q = arm, orientation_length(arm), q.copy(), q.copy()
@@ -244,7 +245,7 @@ class DrakesFollower:
 
 
 class DampedLeastSquares:
-    """What one writes in ten lines: our kinematics, numpy, one damped step for a command."""
+    """Simple baseline: our kinematics, numpy, one damped step for each command."""
 
     def __init__(self, arm: ArmModel, q: Array) -> None:
         self.arm, self.q, self.J = arm, q.copy(), np.empty((6, len(q)))
@@ -258,7 +259,7 @@ class DampedLeastSquares:
 
 
 class PinocchiosFollower:
-    """One step of the loop that Pinocchio's examples close, with its frames and its logarithm."""
+    """One step of the loop in Pinocchio's examples, with its frames and its logarithm."""
 
     def __init__(self, arm: ArmModel, q: Array) -> None:
         import pinocchio as pin
@@ -287,7 +288,7 @@ class PinocchiosFollower:
 
 
 def followed(arm: ArmModel, follower: Any, motion: Array) -> dict[str, float]:
-    """Along joint positions (N, n) whose poses are the commands."""
+    """Follow joint positions (N, n), whose poses are the commands; return the figures."""
     poses = [pose_of(arm, q) for q in motion]
     seconds, worst, step = np.empty(len(poses)), np.zeros(2), 0.0
     for k, pose in enumerate(poses):
@@ -304,7 +305,7 @@ def followed(arm: ArmModel, follower: Any, motion: Array) -> dict[str, float]:
 
 
 def wavy(arm: ArmModel, samples: int) -> Array:
-    """(samples, n) all joints to and fro around a bent posture, at a third of their speed."""
+    """Return a motion (samples, n) of all joints about a bent posture, at a third of top speed."""
     lower, upper = limits(arm)
     t = PERIOD * np.arange(samples)[:, np.newaxis]
     n = arm.num_joints
@@ -315,9 +316,9 @@ def wavy(arm: ArmModel, samples: int) -> Array:
 
 
 def through_singularity(arm: ArmModel, follower: Any, q: Array) -> dict[str, Any]:
-    """S turns to and fro from a posture, about the axis about which it can hardly turn there.
+    """Return poses that rotate back and forth about the axis of the lost rotation.
 
-    By 0.4 rad to either side in two seconds, and waits for another.
+    S rotates by 0.4 rad to either side in two seconds, then rests.
     """
     J, middle = np.empty((6, len(q))), pose_of(arm, q)
     jacobian(arm.table, q, J)
@@ -355,7 +356,7 @@ class ClosedForm:
 
 
 def against_the_closed_form(arm: ArmModel, poses: int) -> dict[str, Any]:
-    """From references up to 0.02 rad off, away from where steps are damped."""
+    """Return figures from references up to 0.02 rad off, away from damped steps."""
     random, worst, L = np.random.default_rng(1), 0.0, orientation_length(arm)
     statuses: Counter[str] = Counter()
     while statuses.total() < poses:
@@ -379,9 +380,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--poses", type=int, default=100_000)
     parser.add_argument(
-        "--models", type=Path, default=described(), help="example-robot-data/robots"
+        "--models", type=Path, default=described(), help="folder example-robot-data/robots"
     )
-    parser.add_argument("--arms", help="some of them, by name with commas between")
+    parser.add_argument("--arms", help="names of arms, separated by commas (default: all)")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     figures: dict[str, Any] = {}

@@ -1,9 +1,9 @@
-"""Has the exported C kernel the bits of `compensate`, and what do its size and speed cost?
+"""Does the exported C kernel equal `compensate` in every bit, and what are its size and speed?
 
 `python benchmarks/kernel.py [--json FILE] [--readings 1000000]` replays readings with noise,
-contact and invalid values. It takes every compiler that exists here, at -O0 to -O3 without
+contact and invalid values. It uses every compiler that is installed, at -O0 to -O3 without
 contraction: gcc, clang, gcc for aarch64 in qemu, and WebAssembly in node (by ziglang). It prints
-the readings that differ from `compensate` in any bit, bytes of the object, and ns per reading.
+the number of readings that differ from `compensate`, the bytes of the object, and ns per reading.
 
 Baseline: the compiled Python kernel in a loop of its own.
 """
@@ -70,7 +70,7 @@ WebAssembly.instantiate(fs.readFileSync(wasm)).then(({ instance: { exports } }) 
 
 
 def readings(count: int, seed: int = 0) -> Array:
-    """Readings (count, 18) with gravity: motion of the load, contact, noise, and invalid ones."""
+    """Return readings (count, 18) with gravity: moving load, contact, noise, and invalid ones."""
     rng = np.random.default_rng(seed)
     t = DT * np.arange(count)[:, None]
     omega = 2.0 * np.sin(5.0 * t + np.arange(3)) + rng.normal(0.0, 0.01, (count, 3))
@@ -91,7 +91,7 @@ def readings(count: int, seed: int = 0) -> Array:
 
 
 def compensated(rows: Array) -> Array:
-    """Outputs (N, 13) of `compensate`: contact wrench, scaled wrench, flags."""
+    """Return outputs (N, 13) of `compensate`: contact wrench, scaled wrench, flags."""
     loop, out = TARGET.make_compensator(**SCALES), np.empty((len(rows), 13))
     for k, row in enumerate(rows):
         one = loop.step(Reading(k, DT * k, row[:15], gravity=row[15:]), DT * k)
@@ -100,7 +100,7 @@ def compensated(rows: Array) -> Array:
 
 
 def replayed(folder: Path, compile_: list[str], run: list[str]) -> tuple[Array, float, int]:
-    """Outputs (N, 13) of compiled C for `folder`/in, ns per reading, and bytes of the object."""
+    """Return outputs (N, 13) of compiled C for `folder`/in, ns per reading, and object bytes."""
     for name in ("wrench_compensator", "kernel_replay"):
         source = folder / f"{name}.c"
         subprocess.run(
@@ -115,7 +115,7 @@ def replayed(folder: Path, compile_: list[str], run: list[str]) -> tuple[Array, 
 
 
 def object_size(folder: Path) -> int:
-    """Bytes of code and constants of the kernel's object file."""
+    """Return the bytes of code and constants of the kernel's object file."""
     said = subprocess.run(
         ["size", str(folder / "wrench_compensator.o")], check=True, capture_output=True, text=True
     )
@@ -123,7 +123,7 @@ def object_size(folder: Path) -> int:
 
 
 def in_node(folder: Path) -> tuple[Array, float, int]:
-    """Outputs (N, 13) of WebAssembly in node, ns per reading, and bytes of the module."""
+    """Return outputs (N, 13) of WebAssembly in node, ns per reading, and bytes of the module."""
     module = WASM["compiled"](TARGET)
     (folder / "kernel.wasm").write_bytes(module)
     (folder / "replay.js").write_text(NODE)
@@ -136,7 +136,7 @@ def in_node(folder: Path) -> tuple[Array, float, int]:
 
 @njit(cache=True)
 def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, memory, rest, out):
-    """The compiled Python kernel, as the exported step calls it."""
+    """Call the compiled Python kernel as the exported step does."""
     for k in range(len(rows)):
         if reading_problem(rows[k, :15], largest, limits) == 0:
             parts = rows[k, :15], rows[k, 15:]
@@ -147,7 +147,7 @@ def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, 
 
 
 def python_ns(rows: Array) -> float:
-    """ns per reading of the compiled Python kernel: best of three."""
+    """Return ns per reading of the compiled Python kernel: best of three."""
     s = TARGET.make_compensator().c_settings
     scales = np.array([1.2, 1.2, 1.3, -0.9])
     best = np.inf
@@ -172,7 +172,7 @@ def prepared(folder: Path, rows: Array) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--readings", type=int, default=1_000_000)
     options = parser.parse_args()
     rows = readings(options.readings)

@@ -1,8 +1,8 @@
-"""A rigid load and sensor paths in closed form, for `cause_records.py`.
+"""Rigid load and sensor paths in closed form, for `cause_records.py`.
 
-Newton and Euler's equations about the load's centre of mass give its wrench; nothing comes from the
-package. Frame S is the sensor's, the wrench is what
-the sensor exerts on the load, and names that end with `_W` are of the base.
+Newton and Euler's equations about the load's centre of mass give its wrench, without the package.
+Frame S is the sensor's. The wrench is that of the sensor on the load. Names that end with `_W` are
+of the base.
 """
 
 from __future__ import annotations

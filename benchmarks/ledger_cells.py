@@ -1,13 +1,14 @@
-"""Random cells of the whole station with `ledger`: slanted walls, friction, edges, let go.
+"""Random cells of the whole station with `ledger`: slanted walls, friction, edges, letting go.
 
 `python benchmarks/ledger_cells.py --cells N --seed S [--jobs J] [--json FILE] [--method M ...]`
-draws cell i from (S, i). FILE keeps finished cells, so an interrupted run goes on. The hand presses
+draws cell i from (S, i). FILE keeps finished cells, so an interrupted run continues. The hand
+presses
 on a wall, rubs and rests, or taps; it rests, retracts, presses again and lets go.
 
 Criteria of each cell:
 
-energy    hand and actual motion, plus E_0: at least -1e-6 J, by translation and rotation apart
-rest      in the last second of the hold hand and slave move by at most 0.5 mm peak to peak
+energy    hand and actual motion, plus E_0: at least -1e-6 J, for translation and rotation each
+rest      in the last second of the hold, hand and slave move by at most 0.5 mm peak to peak
 vector    mean rendered force without the load's weight, against the scaled contact force: within
           10 % (0.05 N at least), from 1 s and two round trips after the hand's intent rests
 quiet     rendered force above 5 Hz in the same second: at most 0.05 N rms
@@ -375,7 +376,7 @@ KNOWN = {
     "20 N, let go": _fault(force=19.0, grip="firm", stiffness=2e4),
     "taps, 600 ms": _fault(network="geostationary", stiffness=2e4, action="taps", frequency=2.0),
 }
-"""Faults that were found from outside."""
+"""Faults that earlier searches found."""
 
 
 def print_row(row: dict[str, Any]) -> None:
@@ -398,10 +399,10 @@ def print_row(row: dict[str, Any]) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the cells and print them; return 1 if a cell fails a criterion."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, default=200, help="number of cells")
-    parser.add_argument("--seed", type=int, default=0, help="of all cells")
-    parser.add_argument("--only", type=int, nargs="+", help="numbers of the cells")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--cells", type=int, default=200, help="number of cells (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all cells (default: 0)")
+    parser.add_argument("--only", type=int, nargs="+", help="run only the cells with these numbers")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--method", nargs="+", choices=METHODS, default=["ledger"])
     parser.add_argument("--known", action="store_true", help="run the known faults instead")
     parser.add_argument("--json", type=Path, help="file of the cells; finished ones are kept")

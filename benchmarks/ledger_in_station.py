@@ -1,21 +1,21 @@
-"""Does `ledger` hold its promises in the whole station, over what network, leaf, hand and sigma?
+"""Does `ledger` meet its criteria in the whole station, over what network, leaf, hand and sigma?
 
 `python benchmarks/ledger_in_station.py [--json FILE]` presses on a leaf as `compare-passivity` does
-(`lab.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs,
-each with the station's noisy sensor and its identified load, or with an ideal sensor and the true
-load (`--ideal`). `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
-`--friction` is that of the arm's joints at the tool [N], by `--damping` the leaf damps [N s/m]. Of
-each, in the last second of the hold and at the end:
+(`lab.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs. Each has
+the station's noisy sensor and its identified load, or with `--ideal` an ideal sensor and the true
+load. `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
+`--friction` is that of the arm's joints at the tool [N], `--damping` that of the leaf [N s/m]. The
+criteria are, in the last second of the hold and at the end:
 
-stable    at rest, within 0.5 mm peak to peak, and turning as little
-felt      what the hand feels of the contact, the load's weight taken away, over the scaled
-          contact force, less 1; the force is along the vertical
-left      how far the slave is from the hand, 2 s after contact
-energy    the least of hand and actual motion, E_act + E_0, contact and load together, by
-          translation and rotation apart
-chatter   standard deviation of the force felt along the vertical
-motors    the least of hand and motors, E_mot + E_0 and the work that friction has taken from them
-friction  that work, as the hand's force counts it
+stable    at rest, within 0.5 mm peak to peak, and rotating as little
+felt      displayed contact force (without the load's weight) over the scaled contact force, less
+          1; the force is vertical
+left      distance of the slave from the hand, 2 s after contact
+energy    the least of hand and actual motion, E_act + E_0, contact and load together, for
+          translation and rotation each
+chatter   standard deviation of the displayed vertical force
+motors    the least of hand and motors, E_mot + E_0 and the work of friction
+friction  that work, at the scale of the hand's force
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ FELT, LEFT, CHATTER = 0.1, 5e-3, 0.05  # 1, m, N
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One run; see the module."""
+    """Figures of one run; see the module."""
 
     network: str
     leaf: str
@@ -79,7 +79,7 @@ class Cell:
     cpu_s: float
 
     def missed(self) -> list[str]:
-        """Which of its promises the cell does not keep."""
+        """Return the criteria that the cell fails."""
         kept = {
             "stable": self.stable,
             "felt": abs(self.felt_error) <= FELT,
@@ -91,9 +91,10 @@ class Cell:
 
 
 def friction_at_tool(slave: Slave, force: float) -> list[float]:
-    """(n,) of the joints [N m], in proportion to their motors, that take `force` [N] in all.
+    """Return the friction (n,) [N m] of the joints for a force at the tool [N].
 
-    That is at the start, where the tool moves vertically and does not turn.
+    It is proportional to the motor torques, and holds at the start, where the tool moves vertically
+    without rotation.
     """
     nominal = NominalSlave(slave)
     J = np.empty((6, nominal.arm.num_joints))
@@ -103,7 +104,7 @@ def friction_at_tool(slave: Slave, force: float) -> list[float]:
 
 
 def friction_work(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """(N,) that the joints' dry friction has taken up to each row [J], of the slave's own."""
+    """Return the work (N,) of the joints' dry friction up to each row [J], at the slave."""
     v = np.split(result["slave_state"], 2, axis=1)[1]
     coulomb = np.broadcast_to(scenario.slave.friction or [0.0], v.shape)
     power = -(dry_friction(coulomb, v) * v).sum(axis=1)
@@ -111,7 +112,7 @@ def friction_work(result: SimulationResult, scenario: Scenario) -> NDArray[np.fl
 
 
 def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Namespace) -> Cell:
-    """Runs one."""
+    """Run one cell."""
     base = replace(
         base_scenario("contact_transition", asked.seed),
         operator__grip=grip,
@@ -167,7 +168,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
 
 
 def print_cell(one: Cell) -> None:
-    """A line of the table."""
+    """Print a line of the table."""
     name = f"{one.network}, {one.leaf}, {one.grip}, sigma {one.sigma:g}"
     print(
         f"{name:<48}{'yes' if one.stable else 'NO':>4}{100 * one.felt_error:8.1f} %"
@@ -180,22 +181,28 @@ def print_cell(one: Cell) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the cells and prints them; returns 0 if every one keeps every promise."""
+    """Run and print the cells; return 0 if all of them meet all criteria."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS))
     parser.add_argument(
         "--leaf", nargs="+", choices=list(LEAF_THICKNESSES_M), default=list(LEAF_THICKNESSES_M)
     )
     parser.add_argument("--grip", nargs="+", choices=GRIPS, default=list(GRIPS))
     parser.add_argument("--sigma", nargs="+", type=float, default=list(SIGMAS))
-    parser.add_argument("--seed", type=int, default=0, help="of sensor and networks")
-    parser.add_argument("--method", choices=METHODS, default="ledger")
-    parser.add_argument("--ideal", action="store_true", help="an ideal sensor, the true load")
     parser.add_argument(
-        "--friction", type=float, default=0.0, help="of the joints, at the tool [N]"
+        "--seed", type=int, default=0, help="seed of sensor and networks (default: 0)"
     )
-    parser.add_argument("--damping", type=float, help="of the leaf [N s/m]; by default 3 %%")
+    parser.add_argument("--method", choices=METHODS, default="ledger")
+    parser.add_argument(
+        "--ideal", action="store_true", help="use an ideal sensor and the true load"
+    )
+    parser.add_argument(
+        "--friction", type=float, default=0.0, help="friction of the joints, at the tool [N]"
+    )
+    parser.add_argument(
+        "--damping", type=float, help="damping of the leaf [N s/m] (default: 3 %% of critical)"
+    )
     asked = parser.parse_args(arguments)
     print(
         f"{'':<48}{'rest':>4}{'felt':>10}{'left mm':>8}{'E tr J':>9}{'E rot J':>9}{'motors J':>9}"

@@ -1,13 +1,13 @@
-"""Do published results on delay, detection and architectures come out of the simulation?
+"""Does the simulation reproduce published results on delay, detection and architectures?
 
 `python benchmarks/literature.py [--only NAME ...] [--json FILE]`; each name is one publication:
 
-mass           A delay makes a mass feel heavier: 10 % at 25 ms, 20 % at 50 ms, of a device that
-               moves by the measured force (admittance), 6 kg, in a push that lets go. The figures
-               come from a copy of the article whose words were exchanged; the article itself was
-               not at hand. Here: effort over speed at the end of a push, of such a device, and of
-               the station's tool, whose inertia is a delayed force (impedance), by a constant
-               force and by half a sine.
+mass           A delay increases the perceived mass: 10 % at 25 ms, 20 % at 50 ms, for a device that
+               moves by the measured force (admittance), 6 kg, in a push with release. The figures
+               come from a paraphrased copy of the article; the article itself was not available.
+               Here: effort over speed at the end of a push, of such a device, and of the station's
+               tool, whose inertia is a delayed force (impedance), for a constant force and for a
+               half sine.
 detection      arXiv 2505.08334: inertial sensors detect contacts in 3 to 39 ms, and up to 50 %
                sooner than a momentum observer. Here: `contact_transition`, the threshold on the
                calculated contact force, and an observer with the arm's true model, exact joint
@@ -16,7 +16,7 @@ detection      arXiv 2505.08334: inertial sensors detect contacts in 3 to 39 ms,
 architectures  Rodriguez-Seda, Lee and Spong, T-RO 25(6), 2009: round trips of 8 to 1088 ms, losses
                to 50 %; errors grow with both, with delay more than with loss, and no method is
                best everywhere. Here: all methods in one axis.
-peg            Robotics 14(3), 2025: a delay of 100 ms raises the largest normal force of an
+peg            Robotics 14(3), 2025: a delay of 100 ms increases the largest normal force of an
                insertion, not its time. Here: scenario `insert` with the simulated operator.
 """
 
@@ -56,13 +56,13 @@ from drake_teleop.station.task_measures import task_measures
 
 Array = NDArray[np.float64]
 
-_PUSH_S, _STEP_S = 0.3, 1e-4  # s, of a push (E); s
-_GAIN = 50.0  # 1/s, of the momentum observer
+_PUSH_S, _STEP_S = 0.3, 1e-4  # s, duration of a push (E); s
+_GAIN = 50.0  # 1/s, gain of the momentum observer
 _ROUND_TRIPS, _LOSSES = (0.008, 0.064, 0.256, 0.576, 1.088), (0.0, 0.25, 0.5)  # s; 1
 
 
 def mass() -> dict[str, Any]:
-    """Felt mass over that without delay, less 1 [%]."""
+    """Return the relative increase of the perceived mass by the delay [%]."""
     t = np.arange(0.0, _PUSH_S, _STEP_S)
     shapes = {"constant": np.ones_like(t), "half_sine": np.sin(np.pi * t / _PUSH_S)}
     axis, found = OneAxis(sigma=1.0), {}
@@ -82,7 +82,7 @@ def mass() -> dict[str, Any]:
 
 
 def detection() -> dict[str, Any]:
-    """Delays from the touch [ms]."""
+    """Return delays from the touch [ms]."""
     scenario = replace(LoadScenario("contact_transition"), rates__log_hz=2000.0)
     estimate = identified_load(scenario, False).estimate
     run = simulate_contact(scenario, estimate, lambda name: lambda done, words="": None)
@@ -97,7 +97,7 @@ def detection() -> dict[str, Any]:
 
 
 def residual(result: SimulationResult, arm: ArmModel) -> Array:
-    """(N, n) external torques [share of the motors'] by the generalised momentum."""
+    """Return external torques (N, n) by the generalised momentum, over the motors' limits."""
     t, torque = result.t, result["joint_torque"]
     q, v = map(np.ascontiguousarray, np.split(result["slave_state"], 2, axis=1))
     dt, zero = float(t[1] - t[0]), np.zeros(q.shape[1])
@@ -115,7 +115,7 @@ def residual(result: SimulationResult, arm: ArmModel) -> Array:
 
 
 def architectures() -> dict[str, Any]:
-    """Position error of free motion [mm] and force error in the hold [%] of each cell."""
+    """Return position error of free motion [mm] and force error in the hold [%] by cell."""
     cells, model = {}, OneDof(hand_mass=0.2, hand_damping=5.0, hand_stiffness=300.0,
                               wall_stiffness=1000.0)  # fmt: skip
     for method, trip, loss in itertools.product(METHODS, _ROUND_TRIPS, _LOSSES):
@@ -129,7 +129,7 @@ def architectures() -> dict[str, Any]:
         )
         of = figures_of_run(run, model, task)
         swing = (run.t > task.swing_start) & (run.t < task.swing_end)
-        apart = np.sqrt(np.mean((run.master - run.slave)[swing] ** 2))
+        apart = np.sqrt(np.mean((run.master_position - run.slave_position)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf
         cells[method, trip, loss] = 1e3 * float(apart), float(error)
     rows = [
@@ -156,7 +156,7 @@ def architectures() -> dict[str, Any]:
 
 
 def peg(seeds: int = 2) -> dict[str, Any]:
-    """Medians with and without delay."""
+    """Return medians with and without delay."""
     rows: dict[float, list[tuple[float, float, float]]] = {0.0: [], 0.1: []}
     for delay, seed in itertools.product(rows, range(seeds)):
         base = LoadScenario("insert")
@@ -192,7 +192,7 @@ PUBLICATIONS: dict[str, Callable[[], dict[str, Any]]] = {
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=PUBLICATIONS, default=list(PUBLICATIONS))
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     found = {}
     for name in options.only:

@@ -2,16 +2,17 @@
 
     python benchmarks/live.py [--seconds 60] [--slices] [--json FILE]
 
-A script taps on the leaf of `contact_transition` at 1 Hz, fast in between, as a driver would: 60
-messages a second, in through the page's handler; 60 frames a second out, made into JSON, with the
-3D scene. Sensor at 8 kHz, slices of 5 ms, no browser; Python's garbage waits, as in the server.
-Real time: the factor of simulated over elapsed time, lateness of slices, lost time that was given
-up, CPU of the process over elapsed time.
+A script taps on the leaf of `contact_transition` at 1 Hz, with fast motion in between, as a driver
+would. It sends 60 messages per second through the page's handler and receives 60 frames per second
+as JSON, with the 3D scene. The sensor runs at 8 kHz, slices are 5 ms, without a browser; Python's
+garbage collection waits, as in the server.
+Real time: simulated over elapsed time, lateness of slices, lost time, CPU time of the process over
+elapsed time.
 Baseline: the CPU time of the same drive by `repeat`, without clock, page and scene.
 
-With --slices instead: the same taps with each method on each preset of a network, as fast as they
-go, without page and scene, and the CPU time of a slice of 5 ms, the least of three drives: its 99th
-percentile and the most, after the first second of each.
+With --slices: the same taps with each method on each network preset, at full speed, without page
+and scene. The figures are the CPU times of a slice of 5 ms, the least of three drives: 99th
+percentile and largest, after the first second of each.
 """
 
 from __future__ import annotations
@@ -42,19 +43,19 @@ DRIVES = 3
 
 
 def wanted(t: float) -> dict[str, int]:
-    """What the script wants at a time [s], in the units of `Inputs`; the leaf is 65 mm below."""
+    """Return the inputs at a time [s], in the units of `Inputs`; the leaf is 65 mm below."""
     down, sway = 0.5 - 0.5 * np.cos(2 * np.pi * t), np.sin(2 * np.pi * 0.3 * t)
     return {"z": round(-7300 * down), "x": round(300 * sway), "sigma": round(50 + 50 * sway)}
 
 
 def driven(seconds: float, folder: Path) -> dict[str, float]:
-    """Figures of a drive in real time, which is recorded."""
+    """Return the figures of a drive in real time, which is recorded."""
     scenario = live_scenario(LoadScenario("contact_transition"))
     load = identified_load(scenario)
     clock = time.perf_counter
     live = Live(scenario, load, folder, PageScene("own", scenario).frame_part, clock())
     live.join(1, clock())
-    for _ in range(200):  # what is compiled and loaded at the first call
+    for _ in range(200):  # compilation and imports of the first call
         live.tick(clock)
         time.sleep(live.time_to_next_tick(clock()))
     late, bytes_sent, touched, frames = [], 0, 0, 0
@@ -91,10 +92,10 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
 
 
 def slices(seconds: float) -> dict[str, float]:
-    """CPU time of a slice [ms] of each method on each network: 99th percentile and the most.
+    """Return the CPU time of a slice [ms] by method and network: 99th percentile and largest.
 
-    A drive is the same each time: of three, each slice counts at its fastest. They are minutes
-    apart, because whatever else takes the machine does so for half a minute.
+    Each slice counts at its fastest of three equal drives. They are minutes apart, because other
+    programs slow the machine for half a minute at a time.
     """
     scenario = live_scenario(LoadScenario("contact_transition"))
     load, figures = identified_load(scenario), {}
@@ -111,7 +112,7 @@ def slices(seconds: float) -> dict[str, float]:
 
 
 def spent(session: Session, choice: dict[str, int], seconds: float) -> list[float]:
-    """CPU time of each slice [ms] after the first second."""
+    """Return the CPU time of each slice [ms] after the first second."""
     session.apply_inputs(session.inputs.with_changes(choice))
     taken = []
     while session.ms < 1e3 * (1.0 + seconds):
@@ -119,12 +120,12 @@ def spent(session: Session, choice: dict[str, int], seconds: float) -> list[floa
         session.apply_inputs(session.inputs.with_changes(wanted(1e-3 * session.ms)))
         session.advance()
         taken.append(1e3 * (time.thread_time() - start))
-        session.new_rows()  # a page asks for them, too
+        session.new_rows()  # as for a page
     return taken[1000 // SLICE_MS :]
 
 
 def finish(figures: dict[str, float], file: Path | None) -> None:
-    """Prints the figures, and writes them if they are wanted."""
+    """Print the figures, and write them if `file` is given."""
     for name, value in figures.items():
         print(f"{name:28} {value:.4g}", flush=True)
     if file is not None:
@@ -132,10 +133,12 @@ def finish(figures: dict[str, float], file: Path | None) -> None:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--slices", action="store_true", help="of each method on each network")
+    parser.add_argument(
+        "--slices", action="store_true", help="measure the slices of each method on each network"
+    )
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     if options.slices:

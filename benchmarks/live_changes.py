@@ -2,11 +2,12 @@
 
     python benchmarks/live_changes.py [--methods A,B] [--networks A,B] [--depth 95] [--json FILE]
 
-The hand of `touch` (firm grip, JR3) wants to be `depth` mm below its start and so presses on the
-leaf, over no network and without a method. Then a method over a network, and back: by how much the
-slave's command jumps, how far the arm goes away from there afterwards, and by how much what the
-hand feels rises above what it was.
-Baseline: none over the ideal network, where nothing changes but the station.
+The hand of `touch` (firm grip, JR3) has a target `depth` mm below its start and presses on the
+leaf,
+without network and method. Then both change to a method over a network, and back. The figures are
+the jump of the slave's command, the later displacement of the arm, and the increase of the
+displayed force.
+Baseline: none over the ideal network, where only the station is exchanged.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ AFTER = 0.7  # s
 
 
 class Driven:
-    """A drive whose log is kept, slice by slice."""
+    """Drive whose log is kept, slice by slice."""
 
     def __init__(self, scenario: Scenario, load: IdentifiedLoad) -> None:
         self.scenario, self.load = scenario, load
@@ -39,7 +40,7 @@ class Driven:
         self.rows: list[dict[str, np.ndarray]] = []
 
     def go(self, seconds: float, **changes: int) -> None:
-        """Goes on for so long, with changed inputs."""
+        """Drive for a time with changed inputs."""
         self.inputs, self.rows = self.inputs.with_changes(changes), []
         end = self.session.ms + round(1e3 * seconds)
         while self.session.ms < end:
@@ -51,7 +52,7 @@ class Driven:
         return np.concatenate([rows[name if name in rows else instead] for rows in self.rows])
 
     def tool(self) -> np.ndarray:
-        """(n, 3) the sensor's origin in W [m]."""
+        """Return the sensor's origin (n, 3) in W [m]."""
         R_WS, places = np.empty((3, 3)), []
         for q in self.signal("slave_state")[:, : self._arm.num_joints]:
             places.append(np.empty(3))
@@ -59,7 +60,7 @@ class Driven:
         return np.array(places)
 
     def change(self, seconds: float, **changes: int) -> dict[str, float]:
-        """Figures of a change in contact: what was there before it, and what afterwards."""
+        """Return the figures of a change in contact, relative to the state before it."""
         self.go(0.01)
         was = (
             self.signal("pose_received", "pose_command")[-1, 4:],
@@ -80,23 +81,25 @@ class Driven:
 
 
 def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
-    """Figures of one network and method."""
+    """Return the figures of one network and method."""
     still = driven.inputs.with_changes({"network": network, "method": method})
     fills = channel_fill_time_s(chosen_scenario(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
-    driven.go(0.8 + fills, z=z)  # at rest, with nothing on its way
+    driven.go(0.8 + fills, z=z)  # at rest, with no packet on its way
     back = driven.change(0.8, network=0, method=0)
     return figures | {f"back.{name}": value for name, value in back.items()}
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     networks = [name for name in choice_names()["network"][1:] if name != "custom"]
     parser.add_argument("--methods", default=",".join(choice_names()["method"]))
     parser.add_argument("--networks", default=",".join(networks))
-    parser.add_argument("--depth", type=float, default=95.0, help="of the hand's target [mm]")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument(
+        "--depth", type=float, default=95.0, help="depth of the hand's target [mm] (default: 95)"
+    )
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     scenario = live_scenario(LoadScenario("touch"))

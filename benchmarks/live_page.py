@@ -2,14 +2,14 @@
 
     python benchmarks/live_page.py [--trials 20] [--seconds 60] [--json FILE]
 
-In headless Chromium, drawing off (without a graphics card it takes longer than all else): from the
-browser's time stamp of a pointer's move of 20 pixels, of a key, and from the moment that a stick is
-pushed, until the tool has moved by 0.2 mm in the page's scene. A key and a stick lead the hand at
-0.12 m/s: how long hand, device and arm take to move the tool so far is the baseline, in simulated
-time (`way`). From the slice in which the contact force at the hand gets beyond 0.5 N, until
-`playEffect` of a gamepad that is a spy. Then, without a browser and in virtual time, fast free
-motion up and down: in how many frames a gamepad would vibrate, by the contact force and by the
-measured one.
+The page runs in headless Chromium without drawing (which takes longest without a graphics card).
+Latency is the time until the tool has moved by 0.2 mm in the page's scene. It starts with the
+browser's time stamp of a pointer's move by 20 pixels or of a key, or with the push of a stick. Key
+and stick move the hand at 0.12 m/s. The baseline is the time that hand, device and arm take to move
+the tool that far, in simulated time (`way`). Vibration: time from the slice in which the contact
+force at the hand exceeds 0.5 N to `playEffect` of a simulated gamepad. Without a browser and in
+virtual time: share of frames of fast free vertical motion in which a gamepad would vibrate, by the
+contact force and by the measured one.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ window.moved = () => new Promise((done) => {
 
 
 def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
-    """Times from what is done until the tool has moved [ms], by what is done."""
+    """Return the times from an input until the tool has moved [ms], by kind of input."""
     found: dict[str, list[float | None]] = {"pointer": [], "key": [], "stick": []}
     for trial in range(trials):
         for kind, times in found.items():
@@ -67,7 +67,7 @@ def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
             time.sleep(1.5)
             if kind == "pointer":
                 page.mouse("Pressed", 300, 300)
-            page.run("window.until = moved(); 1")  # before the input, which is heard out of turn
+            page.run("window.until = moved(); 1")  # before the input, whose message has priority
             sign = 1 - 2 * (trial % 2)
             if kind == "pointer":
                 page.mouse("Moved", 300 + 20 * sign, 300)
@@ -88,9 +88,9 @@ STICK = "axes[0] = SIGN; wait.since = performance.now()"
 
 
 def way(speed: float = 0.12) -> float:
-    """How long hand, device and arm take to move the tool by 0.2 mm, led as a key leads it: ms.
+    """Return the time of hand, device and arm to move the tool by 0.2 mm, as by a key [ms].
 
-    The target is ahead of what moves at that speed [m/s], as in the page.
+    The target leads the moving hand at that speed [m/s], as in the page.
     """
     scenario = live_scenario(LoadScenario("touch"))
     session, table = Session(scenario, identified_load(scenario)), slave_arm(scenario).table
@@ -109,7 +109,7 @@ def way(speed: float = 0.12) -> float:
 
 
 def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float | None]:
-    """From the slice with a contact of 0.5 N to the gamepad's effect [ms]."""
+    """Return the times from the slice with a contact of 0.5 N to the gamepad's effect [ms]."""
     session = driven._live._session
     found: list[float | None] = []
     touched: list[float] = []
@@ -134,7 +134,7 @@ def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float | None]:
 
 
 def in_the_browser(trials: int) -> dict[str, float]:
-    """Figures of a page in headless Chromium."""
+    """Return the figures of a page in headless Chromium."""
     driven = drive("touch")
     try:
         with opened(driven.url, SPY, Page) as page:
@@ -155,7 +155,7 @@ def in_the_browser(trials: int) -> dict[str, float]:
 
 
 class Clock:
-    """Time that passes only when it is told to."""
+    """Clock that advances only on request."""
 
     now = 0.0
 
@@ -164,7 +164,7 @@ class Clock:
 
 
 def free_motion(seconds: float) -> dict[str, float]:
-    """In how many frames of fast free motion a gamepad would vibrate; in virtual time."""
+    """Return the share of frames of fast free motion in which a gamepad would vibrate."""
     scenario = live_scenario(LoadScenario("touch"))
     clock, seen, fastest = Clock(), [], 0.0
 
@@ -196,11 +196,11 @@ def free_motion(seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     figures = free_motion(options.seconds) if options.seconds else {}
     if CHROMIUM is None:

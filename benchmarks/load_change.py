@@ -1,16 +1,16 @@
 """How soon is a grasped object noticed and identified, and what causes false alarms?
 
-The tool of the station, known from 10 s of motion, then moved by sines at 1 kHz for 10 s with other
-noise: with the JR3's noise of force, torque and measured accelerations, and with an ideal sensor.
-After 3 s, nothing happens, or 0.8 kg are grasped or released within 50 ms, or something is touched:
+The station's tool is identified from 10 s of motion. Then it moves by sines at 1 kHz for 10 s with
+different noise: that of the JR3 in force, torque and measured accelerations, or an ideal sensor.
+After 3 s nothing happens, 0.8 kg is grasped or released within 50 ms, or the environment touches:
 
     knock    3 to 40 ms, 5 to 100 N, any direction
     push     2 to 50 N, constant in S, any direction, 3 s
     hand     2 to 30 N that vary by 40 % with 0.3 to 3 Hz, any direction, 4 s
-    along g  2 to 25 N, constant, up or down, 3 s: as a weight that has no inertia
+    along g  2 to 25 N, constant, up or down, 3 s: as a weight without inertia
 
 States are those of `drake_teleop.load.online.change`. Times are per sample in one compiled loop,
-against recursive least squares.
+next to recursive least squares.
 
     python benchmarks/load_change.py [--seeds 500] [--json FILE]
 """
@@ -49,8 +49,8 @@ TOOL = phi_from_mass_com_inertia(
 )
 OBJECT = phi_from_mass_com_inertia(0.8, [0.04, 0.0, 0.16], np.diag([8e-4, 8e-4, 4e-4]))
 OFFSETS = np.array([6.2, -3.9, 8.1, 0.31, -0.42, 0.12])
-# Standard deviations of force [N], torque [N m]; s [m/s^2], omega [rad/s], alpha [rad/s^2]. An
-# ideal sensor's are not quite zero for the monitor.
+# Standard deviations of force [N], torque [N m]; s [m/s^2], omega [rad/s], alpha [rad/s^2]. The
+# monitor requires small positive ones for an ideal sensor.
 SENSORS = {"JR3": ((0.25, 0.012), (0.06, 0.0, 1.5)), "ideal": ((1e-6, 1e-6), (0.0, 0.0, 0.0))}
 CONTACTS = ("knock", "push", "hand", "along g")
 
@@ -58,7 +58,7 @@ Record = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def motion(seed: int) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """(N,) times; (s, omega, alpha) and the vertical in S, (N, 3) each.
+    """Return times (N,); (s, omega, alpha) and the vertical in S, (N, 3) each.
 
     Roll, pitch, yaw and the acceleration of So are sines.
     """
@@ -85,7 +85,7 @@ def motion(seed: int) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
 
 
 def touch(kind: str, seed: int, t: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(N, 6) wrench of the environment on the tool, 0.2 m in front of So, give or take 2 cm."""
+    """Return the wrench (N, 6) of the environment on the tool, about 0.2 m in front of So."""
     rng, after = np.random.default_rng([seed, 1]), t - EVENT
     direction = rng.normal(size=3)
     direction = np.broadcast_to(direction / np.linalg.norm(direction), up.shape)
@@ -108,7 +108,7 @@ def touch(kind: str, seed: int, t: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def record(sensor: str, seed: int, kind: str = "free", load: np.ndarray = TOOL) -> Record:
-    """Measured wrench and motion."""
+    """Return measured wrench and motion."""
     t, clean, up = motion(seed)
     F = OFFSETS + non_contact_wrench(*clean, load)
     if kind in ("grasp", "release"):
@@ -125,7 +125,7 @@ def record(sensor: str, seed: int, kind: str = "free", load: np.ndarray = TOOL) 
 
 
 def known(sensor: str, load: np.ndarray = TOOL, seed: int = 10**6) -> Identification:
-    """The load from a record of its own."""
+    """Return the load, identified from another record."""
     wrench_std, (s, omega, alpha) = SENSORS[sensor]
     noise = NoiseStd(np.repeat(wrench_std, 3), s, omega, alpha)
     rows = record(sensor, seed, load=load)
@@ -157,12 +157,12 @@ class Monitor:
 
     @property
     def load(self) -> Identification:
-        """Known load; the new one once it is identified."""
+        """Known load, or the new one once it is identified."""
         return identified_or_known_load(self.memory, self.known)
 
     @property
     def changed_at(self) -> float:
-        """Start of the newest new load [s after the first sample]."""
+        """Start of the newest load [s after the first sample]."""
         return float(self.samples - new_load_age(self.memory)) * self.period
 
 
@@ -172,7 +172,7 @@ def monitor(sensor: str, load: Identification) -> Monitor:
 
 
 def study(sensor: str, kind: str, seeds: int) -> dict[str, Any]:
-    """The states that were reached, delays [s], and errors of the object [%, mm]."""
+    """Return the reached states, delays [s], and errors of the object [%, mm]."""
     total = TOOL + OBJECT if kind == "release" else TOOL
     load = known(sensor, total)
     highest, last, delays, errors, changed = [], [], [], [], []
@@ -205,7 +205,7 @@ def study(sensor: str, kind: str, seeds: int) -> dict[str, Any]:
 
 
 def times(repetitions: int = 7) -> dict[str, float]:
-    """Least CPU microseconds a sample, interleaved."""
+    """Return the least CPU microseconds per sample, interleaved."""
     load, best = known("JR3"), {}
     for _ in range(repetitions):
         for name in ("recursive least squares", "known", "disturbed"):
@@ -228,7 +228,7 @@ def times(repetitions: int = 7) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=500)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     report: dict[str, Any] = {"seeds": arguments.seeds}
     for sensor in SENSORS:

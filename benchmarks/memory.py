@@ -1,8 +1,8 @@
 """Does the memory of a long simulation stay constant when its log is written to disk?
 
-The contact of Fig. 8 again and again. Resident memory after the first minute and at the end, with
-the log written in parts, against the same station with its log in memory for two minutes at most.
-Each runs in a process of its own. Needs /proc, so Linux.
+The contact of Fig. 8 is repeated. The figures are the resident memory after the first minute and at
+the end, with the log written in parts. The baseline is the same station with its log in memory, for
+at most two minutes. Each runs in a process of its own. It needs /proc, so Linux.
 
     python benchmarks/memory.py [--seconds 600] [--json FILE]
 """
@@ -24,14 +24,16 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
-FIRST = 60.0  # s, whose growth is not counted: compilation, buffers, caches
+FIRST = 60.0  # s, memory of this time does not count: compilation, buffers, caches
 IN_MEMORY = 120.0  # s
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=600.0, help="more than 60")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--seconds", type=float, default=600.0, help="simulated time [s], more than 60"
+    )
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     figures = {}
     for name, seconds in (
@@ -52,7 +54,7 @@ def main() -> None:
 
 
 def repeated_contact(seconds: float) -> Scenario:
-    """The movement of Fig. 8 for as long as that, with a touch at every lower turn."""
+    """Return the movement of Fig. 8 for this time, with a touch at every lower turning point."""
     up_down = Sine(
         t_start=0.1, duration=seconds + 10, ramp=1.8, frequency=2.63, translation=[0, 0, 0.062]
     )
@@ -64,7 +66,7 @@ def repeated_contact(seconds: float) -> Scenario:
 
 
 def measure(seconds: float, on_disk: bool) -> dict[str, float]:
-    """Simulates, and looks at this process's memory after `FIRST` and at the end."""
+    """Simulate; return this process's memory after `FIRST` and at the end."""
     scenario = repeated_contact(seconds)
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     start, seen = time.process_time(), {}
@@ -94,7 +96,7 @@ def measure(seconds: float, on_disk: bool) -> dict[str, float]:
 
 
 def resident() -> int:
-    """Resident memory of this process [bytes]."""
+    """Return the resident memory of this process [bytes]."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return 1024 * int(line.split()[1])

@@ -1,9 +1,9 @@
 """How much of the paper's 100 N remains after elimination, by source of the motion?
 
-The tool goes up and down at 2.63 Hz without turning, as in the scenario free_motion_force; truth ->
-sensor -> estimation of the motion -> F - F_o - V phi with the true phi. The baseline is the same
-record with nothing, or with the weight alone, taken away. Then the load is identified, by least
-squares, from 6 s in which all joints turn.
+The tool moves up and down at 2.63 Hz without rotation, as in the scenario free_motion_force. The
+chain is truth -> sensor -> estimation of the motion -> F - F_o - V phi with the true phi. The
+baseline is the same record without elimination, or with the weight alone eliminated. Then the load
+is identified by least squares from 6 s in which all joints rotate.
 
     python benchmarks/motion_estimation.py [--json FILE]
 """
@@ -59,7 +59,7 @@ AMPLITUDE = 0.078
 
 
 def motion(arm: Any, frequency: float, amplitude: float) -> tuple[Array, Array, Array]:
-    """q, v, vdot (N, n) of the vertical sine, which grows for 0.6 s."""
+    """Return q, v, vdot (N, n) of the vertical sine, which grows for 0.6 s."""
     coarse = np.arange(0.0, SECONDS + 0.02, min(4e-3, 0.02 / frequency))
     x = np.clip(coarse / 0.6, 0.0, 1.0)
     swing = x**3 * (10 - 15 * x + 6 * x**2) * np.sin(2 * np.pi * frequency * coarse)
@@ -96,7 +96,7 @@ def estimate(constants, memory, table, readings, samples):  # type: ignore[no-un
 
 
 def turning(arm: Any, seed: int) -> tuple[Array, Array, Array]:
-    """q, v, vdot (N, n): four sines in each joint, 8 rad/s^2 at most."""
+    """Return q, v, vdot (N, n): four sines in each joint, 8 rad/s^2 at most."""
     random, n = np.random.default_rng(seed), arm.num_joints
     w, phase = 2 * np.pi * random.uniform(0.5, 3.0, (4, n)), random.uniform(0, 2 * np.pi, (4, n))
     angle = w * (np.arange(round(7.0 / T)) * T)[:, None, None] + phase
@@ -105,7 +105,7 @@ def turning(arm: Any, seed: int) -> tuple[Array, Array, Array]:
 
 
 class Record:
-    """A true motion, and what is left of its wrench by way of a sensor and an estimation."""
+    """True motion, and the residual of its wrench after a sensor and an estimation."""
 
     def __init__(self, arm: Any, moved: tuple[Array, Array, Array]) -> None:
         self.arm = arm
@@ -122,7 +122,7 @@ class Record:
         config: MotionEstimationConfig,
         believed: WristSensorConfig | None = None,
     ) -> tuple[Array, float]:
-        """The samples (N, 16 + n) after the start, and the microseconds that one takes."""
+        """Return the samples (N, 16 + n) after the start, and the microseconds per sample."""
         n = self.truth.shape[1] - 15
         noise = np.random.default_rng(0).standard_normal(
             (len(self.truth) // 32 + 1, NOISE_BLOCK_SIZE)
@@ -141,7 +141,7 @@ class Record:
         config: MotionEstimationConfig,
         believed: WristSensorConfig | None = None,
     ) -> dict[str, float]:
-        """Force [N] and torque [N m] that stay, delay, and microseconds."""
+        """Return the residual force [N] and torque [N m], delay, and microseconds."""
         samples, microseconds = self.samples(sensor, config, believed)
         s, omega, alpha = samples[:, 6:9], samples[:, 9:12], samples[:, 12:15]
         wrench = contact_wrench(samples[:, :6], sensor.offset, s, omega, alpha, self.arm.phi_load)
@@ -156,7 +156,7 @@ class Record:
     def identified(
         self, sensor: WristSensorConfig, config: MotionEstimationConfig
     ) -> dict[str, float]:
-        """Errors of the load by least squares at 1 kHz."""
+        """Return the errors of the load by least squares at 1 kHz."""
         samples = self.samples(sensor, config)[0][::8]
         wrench, s, omega, alpha = np.split(samples[:, :15], [6, 9, 12], axis=1)
         found = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
@@ -172,7 +172,7 @@ class Record:
 
 
 def principal(phi: Array) -> tuple[float, Array, Array]:
-    """Mass, centre of mass, principal inertias about it."""
+    """Return mass, centre of mass, and principal inertias about it."""
     m, c = float(phi[0]), phi[1:4] / phi[0]
     inertia = phi[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3)
     return m, c, np.linalg.eigvalsh(inertia - m * (c @ c * np.eye(3) - np.outer(c, c)))
@@ -198,7 +198,7 @@ def by_source(record: Record) -> dict[str, dict[str, float]]:
 
 
 def identified(arm: Any) -> dict[str, dict[str, float]]:
-    """Medians over six motions."""
+    """Return medians over six motions."""
     records, rows = [Record(arm, turning(arm, seed)) for seed in range(6)], {}
     for name, sensor in sensors().items():
         for source in SOURCES:
@@ -211,7 +211,7 @@ def identified(arm: Any) -> dict[str, dict[str, float]]:
 
 
 def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
-    """The accelerometer is late, and the estimation does not know."""
+    """Return the residual if the accelerometer is later than the estimation assumes."""
     jr3 = without_parts(PRESETS["jr3_85m35a3"], "drift")
     return {
         source: {
@@ -226,13 +226,13 @@ def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     arm = AddSlavePlant(DiagramBuilder(), Slave(), None).arm
     sources = by_source(Record(arm, motion(arm, 2.63, AMPLITUDE)))
     mismatches = {}
     for frequency in (2.63, 10.0, 20.0, 40.0):
-        # The same acceleration at every frequency.
+        # The acceleration is the same at every frequency.
         amplitude = AMPLITUDE * (2.63 / frequency) ** 2
         record = Record(arm, motion(arm, frequency, amplitude))
         for source, row in by_mismatch(record).items():

@@ -1,14 +1,16 @@
 """Is the wrist wrench equal to that of MuJoCo along the same motion?
 
-For each arm the station runs in free motion. At each of the hand's instants MuJoCo, which has read
-the same URDF by itself, is given joint positions, velocities and accelerations, and says by its own
-inverse dynamics what crosses the joint between the sensor's frame and what hangs there: of the
-Panda its own gripper, of the UR5 a tool of numbers. All six components are compared in S, with what
-the ideal wrist sensor of the station put out at that instant.
+For each arm the station runs in free motion. At each of the hand's sampling times MuJoCo, with its
+own reader of the same URDF, gets joint positions, velocities and accelerations. Its inverse
+dynamics
+gives the wrench in the joint between the sensor's frame and the load: for the Panda its gripper,
+for
+the UR5 a tool with given inertia. All six components in S are compared with the output of the
+station's ideal wrist sensor at that time.
 
     python benchmarks/mujoco_wrench.py [--arms panda,ur5] [--models DIR] [--json FILE]
 
-Wants the extra `bench`: MuJoCo, and the models of example-robot-data (or --models, its robots).
+It needs the extra `bench`: MuJoCo, and the models of example-robot-data (or --models, its robots).
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from drake_teleop.station.slave.tool import Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 _TOOL = Tool(mass=1.5, com=[0.01, -0.02, 0.06], inertia=[4e-3, 3e-4, -2e-4, 5e-3, 1e-4, 2e-3])
-#: File, and the slave: the first carries what its model has.
+#: File and slave; the first arm carries the load of its model.
 ARMS = {
     "panda": (
         "panda_description/urdf/panda.urdf",
@@ -46,7 +48,7 @@ ARMS = {
         Slave(sensor_frame="tool0", position=[0.5, 0.1, 0.4], tool=_TOOL),
     ),
 }
-_TURNS = [0.2, -0.15, 0.3]  # rad, of the hand
+_TURNS = [0.2, -0.15, 0.3]  # rad, motion of the hand
 _READ_BY_ITSELF = '<mujoco><compiler fusestatic="false" balanceinertia="false"/></mujoco>'
 
 
@@ -54,9 +56,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(ARMS))
     parser.add_argument(
-        "--models", type=Path, default=described(), help="example-robot-data/robots"
+        "--models", type=Path, default=described(), help="folder example-robot-data/robots"
     )
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     if arguments.models is None:
         raise SystemExit("no example-robot-data: install the extra bench, or give --models")
@@ -73,7 +75,7 @@ def main() -> None:
 
 
 def compare(slave: Slave) -> dict[str, float]:
-    """The largest differences over a second of 3 Hz, and how much there is to compare."""
+    """Return the largest differences over a second of 3 Hz, and the largest values."""
     scenario = _moving(slave)
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -126,10 +128,10 @@ def _moving(slave: Slave) -> Scenario:
 
 
 class Twin:
-    """The same arm in MuJoCo, which reads the same file.
+    """The same arm in MuJoCo, from the same file.
 
     Args:
-        slave: with a URDF of which shapes do not matter, and what hangs on its sensor frame.
+        slave: with a URDF, whose shapes are ignored, and the load on its sensor frame.
     """
 
     def __init__(self, slave: Slave) -> None:
@@ -147,14 +149,14 @@ class Twin:
                 explicitinertial=True,
             )  # fmt: skip
         self.model = spec.compile()
-        # Fingers stand where they are.
+        # Fingers keep their positions.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         self.data = mujoco.MjData(self.model)
         self.S = self.model.body(slave.sensor_frame).id
         self.on_sensor = np.flatnonzero(self.model.body_parentid == self.S)
 
     def wrench(self, joints: list[str], q: Any, v: Any, vdot: Any) -> Any:
-        """(6,) [f; tau] that S exerts on what hangs there, at its origin, in S."""
+        """Return the wrench (6,) [f; tau] of S on the load, about the origin of S, in S."""
         data = self.data
         for k, name in enumerate(joints):
             joint = self.model.joint(name)

@@ -1,15 +1,15 @@
 """Which mistakes in the numeric code would no test notice?
 
-Makes seeded mistakes, one at a time (`mutations.py`), in all files that compute. Each file gets a
-share in proportion to the root of its number of places for mistakes. For each mistake the related
-tests run, the most direct and quickest first, until one fails. A mutant that passes all of them has
-survived: it needs a test, or a reason in `mutants_equivalent.yaml` why no result changes.
+The script plants seeded mistakes, one at a time (`mutations.py`), in all files that compute. A
+file's share is proportional to the root of its number of places for mistakes. For each mistake the
+related tests run, the most direct and quickest first, until one fails. A mutant that passes all of
+them has survived: it needs a test, or a reason in `mutants_equivalent.yaml` why no result changes.
 
     python benchmarks/mutants.py [--number 220] [--seed 0] [--only FILE ...] [--near] [--jobs 2]
 
-All happens in copies in a folder for temporary files. What is found is written there at once, so
-that the same command goes on after an interruption; `--again` runs the survivors again. Each mutant
-runs in a fork of this process, which has imported the libraries already.
+It works on copies in a temporary folder. Results are written at once, so that the same command
+continues after an interruption; `--again` runs the survivors again. Each mutant runs in a fork of
+this process, which has already imported the libraries.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from mutations import Mutation, mutations
 PACKAGE = "drake_teleop"
 GROUPS = ("station", "lab", "live")
 """Packages whose subpackages have test folders of their own."""
-#: Tests of texts and long runs; none of them checks one number of one package.
+#: Tests of texts and long runs, which do not check single numbers of one package.
 LEFT_OUT = {"test_benchmarks", "test_layers", "test_notebooks", "test_packaging", "test_quality"}
 LEFT_OUT |= {"test_readme", "test_language"}
-#: Seconds of processor that one test may take before it counts as endless; compiling takes most.
+#: Limit of the CPU time of a test [s]; compilation takes most of it.
 ENDLESS = 120
 _LIBRARIES = """pytest hypothesis.strategies numba scipy.linalg scipy.optimize scipy.stats
 scipy.signal matplotlib.pyplot control pydantic yaml pydrake.geometry pydrake.multibody.plant
@@ -53,19 +53,21 @@ pydrake.multibody.parsing pydrake.systems.analysis pydrake.systems.primitives"""
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--number", type=int, default=220, help="of mutants")
+    parser.add_argument("--number", type=int, default=220, help="number of mutants (default: 220)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", default=[""], help="parts of the paths of files")
+    parser.add_argument("--near", action="store_true", help="run only tests of the package or file")
+    parser.add_argument("--marks", default="not checks", help="marks of the tests, as pytest's -m")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel processes")
     parser.add_argument(
-        "--only", nargs="+", default=[""], help="files with any of these in the path"
+        "--budget", type=float, default=60.0, help="time of the tests for one mutant [s]"
     )
-    parser.add_argument("--near", action="store_true", help="only tests of the package or file")
-    parser.add_argument("--marks", default="not checks", help="tests to run, as pytest's -m")
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--budget", type=float, default=60.0, help="s of tests for one mutant")
-    parser.add_argument("--again", action="store_true", help="run what survived once more")
+    parser.add_argument("--again", action="store_true", help="run survivors again")
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[1])
-    parser.add_argument("--folder", type=Path, help="of copies and records; default: temporary")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--folder", type=Path, help="folder of copies and records (default: temporary)"
+    )
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     root = arguments.root.resolve()
     folder = arguments.folder or Path(tempfile.gettempdir()) / f"{PACKAGE}_mutants"
@@ -103,12 +105,12 @@ def package_of(file: str) -> str:
 
 
 def folder_of(file: str) -> str:
-    """Return a file's subpackage, by which mutants are counted."""
+    """Return a file's subpackage, for the statistics."""
     return "/".join(file.split("/")[1:-1])
 
 
 def sample(root: Path, number: int, seed: int, only: Iterable[str] = ("",)) -> list[Mutation]:
-    """Mutants of all numeric files; those of a file depend on the seed and on that file alone."""
+    """Return mutants of all numeric files; those of a file depend only on the seed and the file."""
     sites = {
         file: mutations(file, (root / file).read_bytes()) for file in numeric_files(root, only)
     }
@@ -126,7 +128,7 @@ def sample(root: Path, number: int, seed: int, only: Iterable[str] = ("",)) -> l
 def _some(
     found: list[Mutation], number: int, draws: random.Random, source: bytes
 ) -> list[Mutation]:
-    """Of each kind as likely as of any other, and no two in one line if there are others."""
+    """Choose mutants with equal probability of all kinds, on different lines if possible."""
     left, chosen = list(found), []
     while left and len(chosen) < number:
         lines = {mutant.line for mutant in chosen}
@@ -143,13 +145,13 @@ def _some(
 
 
 def imports(root: Path) -> dict[str, set[str]]:
-    """Of each file of the package and the tests: the files that it imports, lazily or not."""
+    """Return for each file of package and tests the files that it imports, lazily or not."""
     paths = [*(root / PACKAGE).rglob("*.py"), *(root / "tests").rglob("*.py")]
     files = {path.relative_to(root).as_posix(): path for path in paths}
     modules = {file.removesuffix(".py").replace("/", "."): file for file in files}
     modules |= {name.removesuffix(".__init__"): file for name, file in modules.items()}
     trees = {file: ast.parse(path.read_bytes()) for file, path in files.items()}
-    # The package's names are those of the modules that it takes them from.
+    # The package re-exports names of the modules that it imports.
     homes = {
         alias.name: modules[node.module]
         for node in ast.walk(trees[f"{PACKAGE}/__init__.py"])
@@ -180,10 +182,10 @@ def imports(root: Path) -> dict[str, set[str]]:
 
 
 def distances(graph: dict[str, set[str]], start: str) -> dict[str, int]:
-    """How many imports it takes from `start` to each file that it can reach."""
+    """Return the number of imports from `start` to each file that it reaches."""
     reached, layer = {start: 0}, {start}
     while layer:
-        # The command line can reach everything; a test of one command sees what that one uses.
+        # The command line imports all modules; the test of a command uses only some.
         layer = {
             f for file in layer - {f"{PACKAGE}/cli/main.py"} for f in graph[file]
         } - reached.keys()
@@ -204,7 +206,7 @@ def remoteness(file: str, test: str, reach: dict[str, int]) -> int:
 def related(
     file: str, reach: dict[str, dict[str, int]], seconds: dict[str, float], budget: float
 ) -> list[str]:
-    """Test files that can see `file`, the nearest and quickest first, of `budget` seconds."""
+    """Return test files that import `file`, nearest and quickest first, within `budget` seconds."""
     tests = sorted(
         (test for test in seconds if file in reach[test]),
         key=lambda test: (remoteness(file, test, reach[test]), seconds[test]),
@@ -223,7 +225,7 @@ def related(
 def tested(
     root: Path, folder: Path, made: list[Mutation], arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """The record of each mutant, from the file of records or new."""
+    """Return the record of each mutant, from the file of records or new."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends the forks too, see below
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     for library in _LIBRARIES.split():
@@ -241,7 +243,7 @@ def tested(
     if wanted:
         files = {mutant.file for mutant in wanted}
         reach, seconds = warmed(root, tree, folder, files, arguments)
-    # In any order, so that an interrupted run is a sample of all packages too.
+    # In random order, so that an interrupted run is a sample of all packages.
     random.Random(arguments.seed).shuffle(wanted)
     running: dict[Any, tuple[Mutation, Fork]] = {}
     try:
@@ -270,7 +272,7 @@ def tested(
 
 
 def _over(running: dict[Any, tuple[Mutation, Fork]]) -> list[Any]:
-    """Those that have ended, or wait for what never comes."""
+    """Return forks that have ended, or that wait too long."""
     over = wait(list(running), timeout=5.0)
     return over or [each for each, (_, fork) in running.items() if fork.waits_too_long()]
 
@@ -282,17 +284,19 @@ def _record(mutant: Mutation, source: bytes) -> dict[str, Any]:
 
 
 def _name(mutant: Mutation, source: bytes) -> str:
-    """What it is known by in the records: its text and place."""
+    """Return the identifier in the records: text and place."""
     return " ".join([mutant.file, str(mutant.start), *mutant.lines(source)])
 
 
 def warmed(
     root: Path, tree: Path, folder: Path, files: Iterable[str], arguments: argparse.Namespace
 ) -> tuple[dict[str, dict[str, int]], dict[str, float]]:
-    """Makes `tree` a copy of `root` in which all that the tests need is compiled already.
+    """Make `tree` a copy of `root` with all code compiled that the tests need.
 
     Returns:
-        What each test file reaches, and the seconds of each that passed and reaches any of `files`.
+        The files that each test file reaches, and the time [s] of each that passed and reaches any
+        of
+        `files`.
     """
     changed = _renewed(root, tree)
     graph = imports(tree)
@@ -317,7 +321,7 @@ def warmed(
         and any(f in reach[test] and remoteness(f, test, reach[test]) <= farthest for f in files)
     ]
     print(f"{len(new)} test files without any mutant", flush=True)
-    for test in sorted(new):  # one by one: what fails without a mutant tells nothing with one
+    for test in sorted(new):  # one by one: a test that fails without a mutant has no meaning
         fork = Fork(tree, [test], arguments.marks)
         while fork.process.is_alive() and not fork.waits_too_long():
             fork.process.join(5.0)
@@ -331,7 +335,7 @@ def warmed(
 
 
 def _renewed(root: Path, tree: Path) -> set[str]:
-    """Copies to `tree` what has changed in `root`; returns those files."""
+    """Copy changed files of `root` to `tree`; return them."""
 
     def files(folder: Path) -> set[str]:
         kept = set()
@@ -353,7 +357,7 @@ def _renewed(root: Path, tree: Path) -> set[str]:
 
 
 def _copy(tree: Path, folder: Path, mutant: Mutation) -> Path:
-    """A copy of the tree, of links to its files but for the mutant's."""
+    """Return a copy of the tree, by links to its files except for the mutated one."""
     copy = Path(tempfile.mkdtemp(dir=folder, prefix="mutant_")) / "tree"
     shutil.copytree(tree, copy, copy_function=os.link)
     source = (copy / mutant.file).read_bytes()
@@ -363,7 +367,7 @@ def _copy(tree: Path, folder: Path, mutant: Mutation) -> Path:
 
 
 def _keep_compiled(copy: Path, tree: Path) -> None:
-    """Links what a mutant's tests have compiled; its name says of what, so it is right for all."""
+    """Link the code that a mutant's tests have compiled; its name identifies its source."""
     for code in copy.rglob("*.nbc"):
         kept = tree / code.relative_to(copy)
         kept.parent.mkdir(exist_ok=True)
@@ -372,7 +376,7 @@ def _keep_compiled(copy: Path, tree: Path) -> None:
 
 
 class Fork:
-    """Tests in a process of their own, until one fails."""
+    """Process that runs tests until one fails."""
 
     def __init__(self, tree: Path, tests: list[str], marks: str) -> None:
         self.tree, self.tests = tree, tests
@@ -384,11 +388,11 @@ class Fork:
         self.process.start()
 
     def waits_too_long(self) -> bool:
-        """Whether it stands still: time by the clock, of which a busy machine takes a lot."""
+        """Return whether the process stands still, by a wall time that suits a busy machine."""
         return time.monotonic() - self._start > 20 * ENDLESS
 
     def result(self) -> dict[str, Any]:
-        """What came of it; removes the tree unless it is the one without a mutant."""
+        """Return the result; remove the tree unless it is the one without a mutant."""
         if self.process.is_alive():
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.join()
@@ -410,7 +414,7 @@ class Fork:
 
 
 def _run(tree: Path, tests: list[str], marks: str, found: Path) -> None:
-    """The body of a fork; its exit code is pytest's."""
+    """Run the tests in the fork; its exit code is pytest's."""
     import pytest
 
     os.setsid()
@@ -422,7 +426,7 @@ def _run(tree: Path, tests: list[str], marks: str, found: Path) -> None:
     os.chdir(tree)
     sys.path[:1] = [str(tree)]
     os.environ["PYTHONPATH"] = str(tree)
-    # What was said to a pytest that this runs in: its plugins need not be found from here.
+    # Variables of an outer pytest: its plugins are not available here.
     for name in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
         os.environ.pop(name, None)
     options = [
@@ -438,7 +442,7 @@ def _run(tree: Path, tests: list[str], marks: str, found: Path) -> None:
     ]
     options.append(f"--basetemp={tree.parent / 'temporary'}")
     code = 0
-    # In two parts: to collect the far tests imports and compiles more than the near ones need.
+    # In two parts: collecting the far tests imports and compiles more than the near ones need.
     for part in (tests[:3], tests[3:]):
         if part and code == 0:
             code = int(pytest.main([*options, *part], plugins=[_Watch(found)]))
@@ -448,20 +452,21 @@ def _run(tree: Path, tests: list[str], marks: str, found: Path) -> None:
 
 
 class _Watch:
-    """A plugin of pytest that notes times and the first failure, and ends endless tests."""
+    """Plugin of pytest that records times and the first failure, and ends endless tests."""
 
     def __init__(self, found: Path) -> None:
         self._found = found
         self._notes = json.loads(found.read_text()) if found.exists() else {"durations": {}}
 
     def pytest_sessionstart(self) -> None:
-        # Byte code goes by whole seconds and length: what is changed and changed back would be old.
-        # tests/conftest.py lets it be written.
+        # Byte code counts as current by whole seconds and length, so old code would be used after a
+        # change and its reversal. tests/conftest.py has enabled it.
         os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self._spent = sum(os.times()[:4])  # of its children too; others do not lengthen it
-        # Not by a handler: compiled code would never come to it. What is written is the suspect.
+        self._spent = sum(os.times()[:4])  # with its children; other programs do not affect it
+        # The kernel ends the process, because compiled code never calls a handler. The current test
+        # is stored before it starts.
         self._write(killer=nodeid, message="endless or crashed")
         signal.setitimer(signal.ITIMER_VIRTUAL, ENDLESS)
 
@@ -496,11 +501,11 @@ class _Watch:
         self._found.write_text(json.dumps(self._notes))
 
 
-# What came out.
+# Results.
 
 
 def explanations() -> dict[tuple[str, str, str], str]:
-    """Why survivors change nothing that matters, by file, old lines and new lines."""
+    """Return the reasons why survivors change no result, by file, old lines and new lines."""
     path = Path(__file__).with_name("mutants_equivalent.yaml")
     entries = yaml.safe_load(path.read_text(encoding="utf-8")) or []
     return {(entry["file"], entry["old"], entry["new"]): entry["why"] for entry in entries}

@@ -1,8 +1,8 @@
 """Small mistakes in numeric code, one at a time, for `mutants.py`.
 
-Each is one that people make in such code: a sign, a frame transposed, arguments exchanged, a limit
-forgotten. Text, messages, checks that only raise, declarations of quantities and default values
-are left alone: their mistakes are not in the numbers.
+They are common ones: a sign, a transposed frame, exchanged arguments, a missing limit. Text,
+messages, checks that only raise, declarations of quantities and default values are unchanged,
+because their mistakes are not in the numbers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _FLIPS |= {ast.Eq: ("==", "!="), ast.NotEq: ("!=", "==")}
 _OTHERS = {"min": "max", "minimum": "maximum", "argmin": "argmax", "nanmin": "nanmax"}
 _OTHERS |= {"floor": "ceil", "sin": "cos"}
 _OTHERS |= {other: name for name, other in _OTHERS.items()}
-#: The order of their arguments is of no consequence, or what they take is no number.
+#: Functions for which the order of arguments does not matter, or whose arguments are not numbers.
 _ANY_ORDER = {"min", "max", "minimum", "maximum", "hypot", "isclose", "allclose", "array_equal"}
 _ANY_ORDER |= {"zip", "isinstance", "getattr", "setattr", "hasattr", "print", "replace", "Cast"}
 _NO_NUMBERS = re.compile(r"(Error|Warning)$|^(quantity|choice|field|warn|print|_?refuse.*)$")
@@ -27,7 +27,7 @@ _TEXT = re.compile(
 )
 _MATRIX = re.compile(r"^_?([A-Z]|jacobian|rotation|matrix|axes)")
 _LIMIT = re.compile(r"clip|limit|saturat|bounded")
-#: Constants outside of this are guards against a division by zero and the like.
+#: Constants outside of this range are guards, for example against a division by zero.
 _SMALL, _LARGE = 1e-6, 1e6
 
 
@@ -37,10 +37,10 @@ class Mutation:
 
     Args:
         file: path below the root, with slashes.
-        kind: the sort of mistake.
-        line: where, from 1.
-        start, end: the bytes of the source that are replaced.
-        new: what by.
+        kind: kind of mistake.
+        line: line number from 1.
+        start, end: replaced bytes of the source.
+        new: new content.
     """
 
     file: str
@@ -51,12 +51,12 @@ class Mutation:
     new: bytes
 
     def applied(self, source: bytes) -> bytes:
-        """The source with the mistake; no line moves, because compiled code is found by lines."""
+        """Return the source with the mistake; lines keep their numbers, for compiled code."""
         lost = source[self.start : self.end].count(b"\n") - self.new.count(b"\n")
         return source[: self.start] + self.new + b"\n" * lost + source[self.end :]
 
     def lines(self, source: bytes) -> tuple[str, str]:
-        """What the lines were that it changes, and what they are, without indentation."""
+        """Return the changed lines before and after, without indentation."""
         first = source.rfind(b"\n", 0, self.start) + 1
         after = source.find(b"\n", self.end)
         old, new = source[first:after], self.applied(source)
@@ -64,7 +64,7 @@ class Mutation:
         return _stripped(old), _stripped(new)
 
     def valid(self, source: bytes) -> bool:
-        """Whether it is Python, and another program."""
+        """Return whether the result is Python and another program."""
         try:
             return ast.dump(ast.parse(self.applied(source))) != ast.dump(ast.parse(source))
         except SyntaxError:
@@ -77,14 +77,14 @@ def _stripped(text: bytes) -> str:
 
 
 def mutations(file: str, source: bytes) -> list[Mutation]:
-    """All that can be made of a file; a few may not be `valid`."""
+    """Return all mutations of a file; a few may not be `valid`."""
     sites = _Sites(file, source)
     sites.visit(ast.parse(source))
     return sites.found
 
 
 class _Sites(ast.NodeVisitor):
-    """Collects what can be changed; what it does not visit is not numeric code."""
+    """Collects the places of mutations; nodes that it does not visit are not numeric code."""
 
     def __init__(self, file: str, source: bytes) -> None:
         self.file, self.source = file, source
@@ -94,7 +94,7 @@ class _Sites(ast.NodeVisitor):
             self._line_starts.append(self._line_starts[-1] + len(line))
         self._compiled = False
 
-    # Where what stands.
+    # Positions.
 
     def _start(self, node: ast.AST) -> int:
         return self._line_starts[node.lineno - 1] + node.col_offset
@@ -113,7 +113,7 @@ class _Sites(ast.NodeVisitor):
         self.found.append(Mutation(self.file, kind, line, start, end, new))
 
     def _operator(self, kind: str, left: ast.AST, right: ast.AST, old: str, new: str) -> None:
-        """Replaces the operator that stands between two operands."""
+        """Replace the operator between two operands."""
         between = self.source[self._end(left) : self._start(right)]
         if b"#" not in between and old.encode() in between:
             start = self._end(left) + between.index(old.encode())
@@ -124,7 +124,7 @@ class _Sites(ast.NodeVisitor):
         new = self._text(second) + middle + self._text(first)
         self._between(kind, first, self._start(first), self._end(second), new)
 
-    # What is left alone.
+    # Unchanged nodes.
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
         for child in node.body:
@@ -153,7 +153,7 @@ class _Sites(ast.NodeVisitor):
 
     visit_Assert = visit_JoinedStr = visit_Raise
 
-    # What is changed.
+    # Changed nodes.
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         left, right, text = node.left, node.right, _has_text(node)
@@ -289,5 +289,5 @@ def _integer(node: ast.AST) -> int:
 
 
 def _is_quantity(node: ast.AST) -> bool:
-    """Whether it may be a number or an array, and is not the same in each call."""
+    """Return whether the node may be a number or an array that differs between calls."""
     return isinstance(node, ast.Name | ast.Attribute | ast.Subscript | ast.BinOp)

@@ -2,14 +2,14 @@
 
     python benchmarks/participants.py [--participants 200] [--trials 40] [--json FILE]
 
-Each simulated participant does one condition of an experiment (`drake_teleop.live.experiment`): two
-intervals, and the answer which of them had the stimulus. Its answers come from the level of the
-stimulus directly, by a psychometric function whose threshold (d' = 1) is drawn from the middle 90 %
-of the levels, log-uniform; no station runs. Counted is in how many the 95 % interval of the
-threshold has the true one, in observers that are as `PsiMethod` assumes and in others; the error is
-the factor by which two thirds of the estimates are off, at most. Of the same participants a
-staircase (two down, one up, steps of a factor 1.4; Levitt 1971) is asked, which goes to 71 %
-correct, at d' of 0.77: its error is about that level, and it has no interval.
+Each simulated participant takes part in one condition of an experiment
+(`drake_teleop.live.experiment`): two intervals, and the answer which of them had the stimulus. A
+psychometric function of the level gives the answers, without a station. Its threshold (d' = 1) is
+drawn log-uniformly from the middle 90 % of the levels. The figures are the share of participants
+whose 95 % interval contains the true threshold, for observers as `PsiMethod` assumes them and for
+others, and the error: the factor that two thirds of the estimates are within. The baseline is a
+staircase (two down, one up, steps of a factor 1.4; Levitt 1971) with the same participants. It
+converges to 71 % correct, d' of 0.77, so its error refers to that level; it has no interval.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from scipy.special import ndtr, ndtri
 from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
 
 LOW, HIGH = 0.2, 20.0
-"""Range of the levels, N say."""
+"""Range of the levels, for example in N."""
 Curve = Callable[[float], float]
-"""P(correct) at a level."""
+"""Function from a level to P(correct)."""
 
 
 def as_thought(rng: np.random.Generator, threshold: float) -> Curve:
-    """Slope and lapses from within what `PsiMethod` thinks possible."""
+    """Return a curve with slope and lapses in the range that `PsiMethod` assumes."""
     slope, lapse = np.exp(rng.uniform(np.log(0.7), np.log(3.0))), rng.uniform(0.0, 0.06)
     return lambda x: float(correct_probability(x, threshold, slope, lapse))
 
 
 def without_lapse(rng: np.random.Generator, threshold: float) -> Curve:
-    """Attentive, d' proportional to the level."""
+    """Return a curve without lapses, with d' proportional to the level."""
     return lambda x: float(correct_probability(x, threshold, 1.0, 0.0))
 
 
 def weibull(rng: np.random.Generator, threshold: float) -> Curve:
-    """Another curve: Weibull of slope 2, scaled to 76 % at the threshold."""
+    """Return a Weibull curve of slope 2, scaled to 76 % at the threshold."""
     half = -math.log(2.0 * (1.0 - ndtr(1.0 / math.sqrt(2.0))))
     return lambda x: 0.5 + 0.49 * (1.0 - math.exp(-half * (x / threshold) ** 2.0))
 
 
 def inattentive(rng: np.random.Generator, threshold: float) -> Curve:
-    """Lapses in 10 % of the trials, more than `PsiMethod` thinks possible."""
+    """Return a curve with lapses in 10 % of the trials, beyond the range of `PsiMethod`."""
     return lambda x: float(correct_probability(x, threshold, 1.5, 0.1))
 
 
 def noticing(rng: np.random.Generator, threshold: float) -> Curve:
-    """High threshold theory: notices or guesses; P(notices) is normal in the logarithm."""
+    """Return a curve of high threshold theory; P(noticed) is log-normal, other answers guessed."""
     share = 2.0 * ndtr(1.0 / math.sqrt(2.0)) - 1.0
     middle = math.log(threshold) - 0.6 * ndtri(share)
     return lambda x: 0.5 + 0.5 * float(ndtr((math.log(x) - middle) / 0.6))
@@ -65,7 +65,7 @@ OBSERVERS = (as_thought, without_lapse, weibull, inattentive, noticing)
 
 
 def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> PsiMethod:
-    """What a participant's answers say."""
+    """Return the `PsiMethod` after the answers of a participant."""
     psi = PsiMethod(LOW, HIGH)
     for _ in range(trials):
         level = psi.next_level()
@@ -74,7 +74,7 @@ def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> PsiMethod:
 
 
 def of_staircase(curve: Curve, rng: np.random.Generator, trials: int, factor: float = 1.4) -> float:
-    """The geometric mean of its last six turns; nan if there are none."""
+    """Return the geometric mean of the last six reversals; nan if there are none."""
     level, in_a_row, down, turns = HIGH, 0, True, []
     for _ in range(trials):
         correct = rng.random() < curve(level)
@@ -90,7 +90,7 @@ def of_staircase(curve: Curve, rng: np.random.Generator, trials: int, factor: fl
 
 
 def figures(observer: Callable[[np.random.Generator, float], Curve], n: int, trials: int) -> dict:
-    """Of n participants."""
+    """Return the figures of n participants."""
     rng = np.random.default_rng(22)
     middle = 0.05 * math.log(HIGH / LOW)
     held, off, width, stair = [], [], [], []
@@ -113,7 +113,7 @@ def figures(observer: Callable[[np.random.Generator, float], Curve], n: int, tri
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--participants", type=int, default=200)
     parser.add_argument("--trials", type=int, default=40)

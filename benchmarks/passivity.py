@@ -2,13 +2,13 @@
 
 `python benchmarks/passivity.py [--json FILE] [--networks N] [--seconds S]` runs both ends of every
 method over N (10 000) random networks of 10 s at 500 Hz: delay up to 300 ms, jitter up to 100 %,
-loss up to 50 % or in bursts with up to 95 %, reordering, duplicates, and a device that saturates
-in half of them. The motion of both ends is random in six degrees of freedom with bounded
-acceleration; the wrenches are random and often push with the motion, as active as it gets. It
-prints for each method the least energy of the channel at the pair f_k (x_k - x_(k-1)), which the
-laws can see, and at the true port of a held wrench, f_(k-1) (x_k - x_(k-1)). Baselines in the same
-run: no method, wave variables that hold the last sample, and the two-layer tank without its margin.
-What has no bound, and `charged_tdpa`, runs over every tenth network.
+loss up to 50 % or in bursts with up to 95 %, reordering, and duplicates. The device saturates in
+half of them. The motion of both ends is random in six degrees of freedom with bounded acceleration.
+The wrenches are random and often push along the motion, so that they are active. It prints for each
+method the least energy of the channel, for two pairs. The methods can observe f_k (x_k - x_(k-1));
+the true port of a held wrench is f_(k-1) (x_k - x_(k-1)). Baselines in the same run: no method,
+wave variables that hold the last sample, and the two-layer tank without its margin. Methods without
+a bound, and `charged_tdpa`, run over every tenth network.
 """
 
 from __future__ import annotations
@@ -63,19 +63,19 @@ ACCELERATION = np.array([20.0, 200.0])  # bounds of |x''| at both ends [m/s^2, r
 WRENCH_SIZE = np.array([6.0, 0.1])  # [N, N m]
 POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
-# What `_run` finds for each group: least energy at either pair, how much stronger than f_e the hand
-# felt it, least energy in the tank of an end.
+# Figures of `_run` for each group: least energy at either pair, excess of the displayed wrench over
+# f_e, least energy in the tank of an end.
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
-WAVE_HOLD = "wave_hold"  # written here, no method of the package
+WAVE_HOLD = "wave_hold"  # implemented here, not in the package
 _OWN_STEPS = (0, 0, 0)
 _STEP = own_memory().vector(6)
-# These run over every network, the rest over every tenth: what has no bound is found out sooner,
-# and `charged_tdpa` has the ledger of `tdpa`.
+# These run over every network, the others over every tenth: methods without a bound fail soon, and
+# `charged_tdpa` has the ledger of `tdpa`.
 EVERY = ("wave", "tdpa", "two_layer", "pspm")
 
 
 def random_motion(rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
-    """Increments (steps, 6) and poses (steps, 7) of a motion with bounded acceleration.
+    """Return increments (steps, 6) and poses (steps, 7) of a motion of bounded acceleration.
 
     The acceleration changes at random about ten times a second, and a spring and a damper keep the
     motion within about 0.5 m and 1 rad.
@@ -108,7 +108,7 @@ def _move(push, most, T, dx, pose):
 
 
 def random_wrench(rng: np.random.Generator, steps: int) -> Array:
-    """(steps, 6) a wrench that changes about five times a second and is often zero."""
+    """Return a wrench (steps, 6) that changes about five times a second and is often zero."""
     value = rng.normal(size=(steps, 6)) * np.repeat(WRENCH_SIZE, 3) * (rng.random((steps, 6)) < 0.7)
     changes = rng.random((steps, 6)) < 5.0 * PERIOD
     last = np.maximum.accumulate(np.where(changes, np.arange(steps)[:, None], 0), axis=0)
@@ -117,7 +117,7 @@ def random_wrench(rng: np.random.Generator, steps: int) -> Array:
 
 @njit
 def _push(wrenches, motion, active, out):
-    """out (N, 6) = wrenches plus `active` times a wrench that pushes along the motion (N, 6)."""
+    """Write wrenches plus `active` times a wrench along the motion (N, 6) to `out` (N, 6)."""
     for k in range(len(out)):
         for g in range(2):
             push = active * WRENCH_SIZE[g] / (_size(motion[k], g) + 1e-9)
@@ -132,10 +132,10 @@ def _size(a, g):
 
 @njit
 def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent, figures):
-    """Least energies of one method over one network; `figures` (2, FIGURES) is written.
+    """Write the least energies of one method over one network to `figures` (2, FIGURES).
 
-    `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends, `wrenches` (N, 6) are the
-    contact's. The slave's port is that of wrench and command, or (`at_motor`) that of its servo.
+    `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends, `wrenches` (N, 6) those of the
+    contact. The slave's port is that of wrench and command, or (`at_motor`) that of its servo.
     """
     hand, felt = np.zeros(6), np.zeros(6)
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
@@ -165,7 +165,7 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
         if at_motor:
             for g in range(2):
                 work[1, g] += dot_of_group(motor, motion[1, k], g)
-            # The pull of the slave's servo from now until the next step.
+            # The force of the slave's servo from now until the next step.
             pose_difference_into(command, poses[1, k], pull)
             for i in range(6):
                 motor[i] = p[SERVO_K][i // 3] * pull[i] - p[SERVO_D][i // 3] * twists[1, i]
@@ -196,7 +196,7 @@ def _master(steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory,
         )
         return
     for i in range(6):
-        b = p[wave.WAVE_IMPEDANCE][i // 3]  # the line's impedance
+        b = p[wave.WAVE_IMPEDANCE][i // 3]  # impedance of the line
         wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL][i] - b * dx[i] / T
     for g in range(2):
         limit_group(wrench, g, limits[g])
@@ -222,8 +222,8 @@ def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, comman
 
 
 def cases() -> dict[str, tuple[str, Array]]:
-    """Name -> (method, its parameters with a device that does not saturate)."""
-    # A soft servo, no damper that fills the tanks and no limit but theirs: energy is short.
+    """Return name -> (method, its parameters with a device that does not saturate)."""
+    # A soft servo, no damper that fills the tanks, and limits only by the tanks: energy is scarce.
     soft: dict[str, Any] = {
         "servo_stiffness": [300.0, 5.0],
         "servo_damping": [0.0, 0.0],
@@ -240,7 +240,7 @@ def cases() -> dict[str, tuple[str, Array]]:
 
 
 def random_network(rng: np.random.Generator) -> NetworkConfig:
-    """A network out of all that the study covers."""
+    """Return a network within the ranges of the study."""
     bursts = rng.random() < 0.5
     burst_loss = float(rng.uniform(0.5, 0.95))
     return NetworkConfig(
@@ -255,7 +255,7 @@ def random_network(rng: np.random.Generator) -> NetworkConfig:
 
 
 def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str, float]]:
-    """Least figures over the networks first..last-1, and CPU time [s], of each method."""
+    """Return least figures over the networks first..last-1, and CPU time [s], by method."""
     first, last, steps = job
     every = cases()
     least = {name: np.full((2, FIGURES), np.inf) for name in every}
@@ -270,9 +270,9 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
         rng = np.random.default_rng(seed)
         network = random_network(rng)
         newest = np.stack([newest_packets(network, seed, way, steps, PERIOD) for way in range(2)])
-        # In a step the master's turn is before the slave's.
+        # In a step, the master comes before the slave.
         newest[1] = np.minimum(newest[1], np.arange(steps) - 1)
-        # No more packets than are still of use: they stay in the cache.
+        # Only as many packets as are in use, so that they stay in the cache.
         sent = np.zeros((2, int((np.arange(steps) - newest).max()) + 1, PACKET_SIZE))
         ends = [motions[rng.integers(32)] for _ in range(2)]
         motion, poses = (np.stack(parts) for parts in zip(*ends, strict=True))
@@ -304,16 +304,16 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
 
 
 def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str, dict[str, float]]:
-    """Runs every method over the networks.
+    """Run every method over the networks.
 
     Returns:
-        Name -> "energy": least energy of the channel at the backward pair [J] (methods at the
-        motor's port are not made for it and get 0); "true_energy": at the true port of held
-        wrenches, with what the tanks held at the start [J]; "tank": least that the tank of an end
-        held, by the work at its port, of methods that have one [J];
-        "stronger": by how much the hand felt more than was received [N, N m]; "us": CPU time of
-        both ends, with the random ports, a step [us]. Least (worst) over networks and over
-        translation and rotation.
+        Name -> "energy": least energy of the channel at the backward pair [J] (0 for methods at the
+        motor's port, which do not bound it); "true_energy": at the true port of held wrenches, with
+        the start energy of the tanks [J]; "tank": least energy of an end's tank, by the work at its
+        port, for methods with tanks [J]; "stronger": excess of the displayed wrench over the
+        received
+        one [N, N m]; "us": CPU time of both ends per step, with the random ports [us]. All are the
+        worst over networks and over translation and rotation.
     """
     steps, share = round(seconds / PERIOD), max(1, -(-networks // (8 * processes)))
     jobs = [(i, min(i + share, networks), steps) for i in range(0, networks, share)]
@@ -339,10 +339,12 @@ def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str,
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the study and prints it; returns 0 if the bounds hold and the baselines break them."""
+    """Run and print the study; return 0 if the bounds hold and the baselines break them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument(
+        "--networks", type=int, default=10_000, help="number of networks (default: 10000)"
+    )
     parser.add_argument("--seconds", type=float, default=10.0, help="simulated time of each [s]")
     options = parser.parse_args(arguments)
     began = time.monotonic()
@@ -362,7 +364,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def holds(result: dict[str, dict[str, float]]) -> bool:
-    """Whether the methods keep their bounds and the baselines do not."""
+    """Return whether the methods keep their bounds and the baselines do not."""
     return (
         result["tdpa"]["energy"] >= -1e-9
         and result["charged_tdpa"]["energy"] >= -1e-9

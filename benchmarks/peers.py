@@ -1,29 +1,29 @@
-"""Ours against what others do, on the same logs: what is left of the wrench, and is the load true?
+"""Is the load of `identify` truer than that of other tools, and is less of the wrench left?
 
 `python benchmarks/peers.py [--json FILE] [--loads 30] [--ntnu DIR] [--bota PYTHON]`, in 10 s each:
 
 * ours: `identify` of one motion of `excite` for the shipped arm, noise, offsets and delay as in
-  calibrate.py; `known` by the rule of `calibrate` where all of it is asked
-  ("mass 0.5 %, com 0.5 mm, inertia 5 %");
+  calibrate.py; `known` by the rule of `calibrate` for "mass 0.5 %, com 0.5 mm, inertia 5 %";
 * least squares: mass, centre of mass, inertia and offsets by plain least squares of the same log,
-  low-passed, no delay, N and N m alike, as scripts do it; intervals of white noise;
-* kth: 20 poses at rest for as long together, with no time to go from one to the next, mass, centre
-  of mass and offsets by plain least squares, as force_torque_tools and ft_tools_ros2 do it; no
-  inertia. The mean of a pose has what the same noise, of the same colours, leaves of it;
-* ours at rest: what `identify` makes of those very poses;
-* static: the same without offsets, as aiofranka's payload.py does it from joint torques, after a
-  tare in free air: their offsets are taken away with an error of 0.2 N and 0.01 N m;
-* vendor: gravity alone, of the true mass and centre of mass, typed in, and a tare at the start.
+  low-passed, without delay, N and N m with equal weights, as in scripts; intervals of white noise;
+* kth: 20 poses at rest in the same time in all, without time between poses; mass, centre of mass
+  and offsets by plain least squares, as force_torque_tools and ft_tools_ros2 do it; no inertia.
+  The mean of a pose has the residual error of the same coloured noise;
+* ours at rest: `identify` of those poses;
+* static: the same without offsets, as aiofranka's payload.py does it from joint torques after a
+  tare in free air: offsets are removed with an error of 0.2 N and 0.01 N m;
+* vendor: gravity alone, by the true mass and centre of mass as user input, and a tare at the start.
 
-With --rls, that many loads are followed by recursive least squares of gravity, bias and mounting
-(a 3 x 4 matrix times [vertical, 1] for force and for torque, as arXiv 2604.23696 describes it; its
-forgetting factor is ours), in slow motion and in a hand's, beside ours: `identify` of one motion of
-`excite`, and a tare. Figures are the share of the wrench that is removed in the second half.
+With --rls, recursive least squares of gravity, bias and mounting is compared for this number of
+loads, in slow motion and in a hand's. Its model is a 3 x 4 matrix times [vertical, 1] for force and
+for torque, as arXiv 2604.23696 describes it; its forgetting factor is ours. Next to it: `identify`
+of one motion of `excite`, and a tare. Figures are the removed share of the wrench in the second
+half.
 
-Held out is another motion of the same load, with offsets of its own, a tare, and 30 Hz. With
---bota, the Python of an environment that has bota-payload-utils and numpy, its estimator is given
-five loads' motions (a hand's, 15 s each), paced by the clock. With --ntnu, the load of NTNU's 24
-poses and what it leaves of the two records in motion, without its mean.
+The held-out record is another motion of the same load, with other offsets, a tare, and 30 Hz. With
+--bota, the Python of an environment that has bota-payload-utils and numpy, its estimator gets five
+loads' motions (a hand's, 15 s each), paced by the clock. With --ntnu, the load of NTNU's 24 poses
+and its residual of the two records in motion, without the mean.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ PEERS = ("ours", "least squares", "kth", "ours at rest", "static", "vendor")
 
 
 class Found(NamedTuple):
-    """A load by one of the peers; (16,) intervals' ends, or None where none is stated."""
+    """Load by one of the methods, with ends (16,) of its intervals, or None."""
 
     phi: Array
     low: Array | None = None
@@ -67,20 +67,20 @@ class Found(NamedTuple):
 
 
 def log_of(stream: Stream) -> Log:
-    """What a stream would record."""
+    """Return the log of a stream."""
     t, values = stream.recorded
     return Log(t, *np.split(values, [6, 9, 12], axis=1))
 
 
 def ours(log: Log, path: Path) -> Found:
-    """`identify`."""
+    """Return the result of `identify`."""
     write_log(log, path)
     load = identify_log(path).identification
     return Found(load.phi, *confidence_intervals(load))
 
 
 def least_squares(log: Log) -> Found:
-    """Plain, with the covariance of white noise."""
+    """Return the result of plain least squares, with the covariance for white noise."""
     wrench, *motion = (low_pass(x, log.dt, 30.0) for x in (log.wrench, *log.motion))
     V = regressor(*motion)
     rows = np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2).reshape(-1, 16)
@@ -90,7 +90,7 @@ def least_squares(log: Log) -> Found:
 
 
 def at_rest(rng: np.random.Generator, phi: Array, *, tared: bool) -> tuple[Array, Array]:
-    """(20, 3) specific forces and (20, 6) mean wrenches of poses at rest."""
+    """Return specific forces (20, 3) and mean wrenches (20, 6) of poses at rest."""
     up = rng.normal(size=(POSES, 3))
     s = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
     still = np.zeros_like(s)
@@ -102,7 +102,7 @@ def at_rest(rng: np.random.Generator, phi: Array, *, tared: bool) -> tuple[Array
 
 
 def static(s: Array, wrench: Array, *, offsets: bool) -> Found:
-    """First moments and, or not, offsets, by plain least squares."""
+    """Return first moments, with or without offsets, by plain least squares."""
     still = np.zeros_like(s)
     rows = regressor(s, still, still)[:, :, :4]
     if offsets:
@@ -112,16 +112,16 @@ def static(s: Array, wrench: Array, *, offsets: bool) -> Found:
 
 
 def ours_at_rest(s: Array, wrench: Array) -> Found:
-    """`identify` of static poses."""
+    """Return the result of `identify` for static poses."""
     still = np.zeros_like(s)
     load = identify_batch(wrench, s, still, still, shared_noise=True).identification
     return Found(usable_phi(load)[0])
 
 
 def held_out(log: Log, phi: Array, up: Array | None = None) -> tuple[float, float]:
-    """Rms of |f| and |tau| that a load leaves after a tare over the record, at 30 Hz.
+    """Return the rms residual of |f| and |tau| after a tare over the record, at 30 Hz.
 
-    With the vertical in S (N, 3), of its weight alone.
+    If the vertical `up` in S (N, 3) is given, only the weight is removed.
     """
     s, omega, alpha = log.motion
     if up is not None:
@@ -133,7 +133,7 @@ def held_out(log: Log, phi: Array, up: Array | None = None) -> tuple[float, floa
 
 
 def simulated(loads: int, folder: Path) -> dict[str, Any]:
-    """Figures of the simulated arm."""
+    """Return the figures of the simulated arm."""
     t = np.arange(round(SECONDS * HZ)) / HZ
     motion = excited(t)
     rows: dict[str, list[list[float]]] = {name: [] for name in PEERS}
@@ -186,14 +186,14 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
 
 
 def slowed(rng: np.random.Generator, t: Array, factor: float) -> Motion:
-    """A hand's motion, `factor` times as slow."""
+    """Return a hand's motion that is `factor` times as slow."""
     s, omega, alpha = hand(rng, t / factor)
     up = turned(omega, (t[1] - t[0]) / factor)
     return 9.81 * up + (s - 9.81 * up) / factor**2, omega / factor, alpha / factor**2
 
 
 def recursive_gravity(up: Array, wrench: Array, forgetting: float) -> Array:
-    """(N, 6) predictions of the wrench, each from the samples before it."""
+    """Return predictions (N, 6) of the wrench, each from the samples before it."""
     P, theta, predicted = 1e6 * np.eye(4), np.zeros((4, 6)), np.empty_like(wrench)
     for row, measured, out in zip(np.c_[up, np.ones(len(up))], wrench, predicted, strict=True):
         out[:] = row @ theta
@@ -204,7 +204,7 @@ def recursive_gravity(up: Array, wrench: Array, forgetting: float) -> Array:
 
 
 def recursive(loads: int, folder: Path) -> dict[str, Any]:
-    """Shares of the wrench that recursive least squares of gravity and ours remove [%]."""
+    """Return the removed shares of the wrench by recursive least squares and by ours [%]."""
     shares: dict[str, list[Array]] = {}
     t = np.arange(round(SECONDS * HZ)) / HZ
     excitation = excited(t)
@@ -234,7 +234,8 @@ def recursive(loads: int, folder: Path) -> dict[str, Any]:
     }
 
 
-# Run by another Python: config, and t and rows as .npy; in the sensor's convention, by the clock.
+# Script for another Python: config, and t and rows as .npy; in the sensor's convention, paced by
+# the clock.
 _BOTA = """
 import sys, time
 import numpy as np
@@ -254,7 +255,7 @@ print("STOPPED", when, int(estimator.is_estimation_successful()))
 
 
 def bota(python: Path, loads: int, folder: Path) -> dict[str, Any]:
-    """Figures of bota-payload-utils' estimator; thresholds and covariances are our guesses."""
+    """Return the figures of bota-payload-utils, with guessed thresholds and covariances."""
     t = np.arange(round(15.0 * HZ)) / HZ
     stops, errors, physical = [], [], []
     for k in range(loads):
@@ -332,7 +333,7 @@ def bota(python: Path, loads: int, folder: Path) -> dict[str, Any]:
 
 
 def ntnu(records: Path, folder: Path) -> dict[str, Any]:
-    """What the load of NTNU's 24 poses leaves of its two records in motion, without the mean."""
+    """Return the residual of NTNU's two records in motion, by the load of its 24 poses."""
     figures = {}
     poses = np.genfromtxt(records / "0-calibration_fts-accel.csv", delimiter=",", names=True)
     wrench = -np.column_stack([poses[name] for name in ("fx", "fy", "fz", "tx", "ty", "tz")])
@@ -349,7 +350,7 @@ def ntnu(records: Path, folder: Path) -> dict[str, Any]:
         log = read_log(described(records, record, folder))
         late = remove_delay(log, choose_delay(log, 30.0, "auto", by_peer["ours"])[0])
         for name, phi in by_peer.items():
-            # Others do not know of a delay, nor of more than gravity.
+            # Other methods have neither a delay nor more than gravity.
             of = late if name == "ours" else log
             motion = of.motion if name == "ours" else (-of.gravity, still_of(of), still_of(of))
             left = low_pass(of.wrench - non_contact_wrench(*motion, phi), of.dt, 30.0)[:, :3]
@@ -360,12 +361,12 @@ def ntnu(records: Path, folder: Path) -> dict[str, Any]:
 
 
 def still_of(log: Log) -> Array:
-    """(N, 3) zeros."""
+    """Return zeros (N, 3)."""
     return np.zeros((len(log), 3))
 
 
 def described(records: Path, record: str, folder: Path) -> Path:
-    """The description of a record, as of docs/logs.md."""
+    """Return the description of a record, as in docs/logs.md."""
     time = {"column": "t", "unit": "us"}
     files = {name: str(records / f"{record}_{name}.csv") for name in ("wrench", "accel")}
     document = {
@@ -403,11 +404,13 @@ def described(records: Path, record: str, folder: Path) -> Path:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--loads", type=int, default=30)
     parser.add_argument("--rls", type=int, default=0, help="loads for recursive least squares")
     parser.add_argument("--ntnu", type=Path, help="folder of the records of NTNU")
-    parser.add_argument("--bota", type=Path, help="a Python that has bota-payload-utils and numpy")
+    parser.add_argument(
+        "--bota", type=Path, help="Python of an environment with bota-payload-utils and numpy"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         figures = simulated(options.loads, Path(folder)) if options.loads else {}

@@ -1,7 +1,8 @@
-"""Is the right cause named, at the right time, and is no number certain and wrong?
+"""Does `identify` name the right cause at the right time, without a false certain number?
 
-Records of `cause_records` contain a cause, several, none, or one without a name, and go as files
-through `identify_log`. A record is *right* if exactly the right causes are named, *part* if some of
+Records of `cause_records` contain a cause, several, none, or one without a name. `identify_log`
+reads
+them as files. A record is *right* if exactly the right causes are named, *part* if some of
 several are, *wrong* if another one is, *silent* if none is, *error* if `identify_log` raises. A
 number is *false* if it is called identified and off by more than four stated deviations and more
 than 2 % of its natural scale. A record that is not right, or has a false number, is *faint* if it
@@ -76,12 +77,12 @@ GROUPS = {
     "inertia": slice(10, 16),
 }
 OUTCOMES = ("right", "part", "wrong", "silent", "error")
-_SMALLEST_MASS = 0.1  # whose natural scale an empty sensor is judged by [kg]
+_SMALLEST_MASS = 0.1  # mass for the natural scales of an empty sensor [kg]
 _DEVIATIONS, _SHARE, _LATE_S, _FAINT = 4.0, 0.02, 0.1, 60.0
 
 
 def judge(found: Identification, phi: Array, offsets: Array | None) -> dict[str, Any]:
-    """Return the false numbers, and of each group how many intervals hold of how many."""
+    """Return the false numbers, and for each group how many of how many intervals hold."""
     truth = np.concatenate([np.zeros(6) if offsets is None else offsets, phi])
     judged = np.array(found.identifiable) & np.repeat([offsets is not None, True], [6, 10])
     error = np.concatenate([found.offsets, found.phi]) - truth
@@ -124,7 +125,7 @@ def _best(found: Identification, phis: Iterable[Array], offsets: list[Array]) ->
 
 
 def numbers(result: IdentifiedLog, record: CauseRecord) -> dict[str, Any]:
-    """Judge all numbers that are stated."""
+    """Judge all stated numbers."""
     truth, parts = record.truth, getattr(result, "loads", ())
     whole = _best(result.identification, [phi for phi, _ in truth.loads], truth.offsets)
     if not parts:
@@ -161,7 +162,7 @@ def time_error(causes: tuple[Any, ...], record: CauseRecord) -> float | None:
             for cause in causes
             if cause.name == name and cause.start_s is not None
         ]
-        if name != "contact":  # a step: both ends of what is stated may be one
+        if name != "contact":  # a step: both ends of the stated time may be one
             stated = [(x, x) for span in stated for x in span]
         if stated:
             apart = np.abs(np.array(spans)[:, None] - np.array(stated)[None]).max(axis=2)
@@ -361,13 +362,15 @@ def chosen(arguments: argparse.Namespace) -> list[Case]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     names = {"kinds": KINDS, "motions": tuple(MOTIONS), "sensors": SENSORS}
-    parser.add_argument("--set", choices=list(SETS), help="kinds, motions, sensors, seeds")
+    parser.add_argument(
+        "--set", choices=list(SETS), help="set of kinds, motions, sensors and seeds"
+    )
     for name, values in names.items():
         parser.add_argument(f"--{name}", help=f"separated by commas: {', '.join(values)}")
-    parser.add_argument("--seeds", help="first-last, or one")
-    parser.add_argument("--check", action="store_true", help="the generator itself")
+    parser.add_argument("--seeds", help="seeds as first-last, or one")
+    parser.add_argument("--check", action="store_true", help="check the generator itself")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="write the figures of each record here")
+    parser.add_argument("--json", type=Path, help="file for the figures of each record")
     arguments = parser.parse_args()
     for name, values in names.items():
         asked = getattr(arguments, name)
@@ -384,7 +387,7 @@ def main() -> None:
         print(*(f"{line}\n" for line in remarks(row)), sep="", end="", flush=True)
         if arguments.json and (
             len(rows) % 25 == 0 or len(rows) == len(cases)
-        ):  # the whole takes long
+        ):  # the whole run takes long
             report = {"figures": summary(rows), "records": rows}
             arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     Console(width=170).print(table(summary(rows)))

@@ -1,16 +1,19 @@
 """How many planted mistakes of a description are found, and how many are false alarms?
 
-Records of 24 s of the arm and the load of `pose_noise`, F and P, as files with a description: a
-wrench at 500 Hz with noise and offsets, poses at 125 Hz, an IMU at 250 Hz; wrench and pose, wrench
-and IMU, or all three. A mistake is planted into the numbers or into the description and
-`check_log` asked. It is named if a finding has one of the right names and holds the right line.
-False alarms are findings, but for "lag", of good logs: as above, with gains that are wrong by 1 %,
-slow, hardly tilted, and real ones.
+Records are 24 s of the arm and the load of `pose_noise`, motions F and P, as files with a
+description: a wrench at 500 Hz with noise and offsets, poses at 125 Hz, an IMU at 250 Hz; wrench
+and
+pose, wrench and IMU, or all three. A mistake is planted into the numbers or the description, and
+`check_log` runs. The mistake is named if a finding has one of the right names and contains the
+right
+line. False alarms are findings, except "lag", of good logs: as above, with gain errors of 1 %,
+slow,
+hardly tilted, and real ones.
 
     python benchmarks/planted_mistakes.py [--runs 1] [--seed 0] [--only KIND ...] [--no-good]
         [--streams pose imu both] [--data FOLDER] [--json FILE]
 
-FOLDER has the records ntnu_fts_imu_contact.
+FOLDER contains the records ntnu_fts_imu_contact.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ class Record:
 def make(
     motion: str, seed: int, *, gain: float = 0.0, slow: float = 1.0, tilt: float = 1.0
 ) -> Record:
-    """A good record."""
+    """Return a good record."""
     rng, path = np.random.default_rng([seed, len(motion), 3]), np.random.default_rng([seed, 7])
     t = {
         "wrench": np.arange(0.0, SPAN, 1 / _WRENCH_HZ),
@@ -108,7 +111,7 @@ def _matrices(record: Record) -> Array:
 
 
 def written(record: Record, folder: Path, streams: tuple[str, ...]) -> Path:
-    """The record's files and description."""
+    """Write the record's files and description; return its path."""
     data: dict[str, Any] = dict(record.top)
     for stream in streams:
         t = record.t[stream]
@@ -137,7 +140,7 @@ def _declared(stream: str, name: str, unit: str) -> Callable[[Record], None]:
 
 
 def _turned(R: Array) -> Callable[[Record], None]:
-    """The sensor reads in other axes: x of the file is R x."""
+    """Rotate the axes of the sensor: x of the file is R x."""
 
     def plant(record: Record) -> None:
         wrench = record.values["wrench"]
@@ -161,7 +164,7 @@ def _tcp(record: Record) -> None:
 
 
 def _direction(record: Record) -> Array:
-    """(3,) of length 1, of the record's seed."""
+    """Return a direction (3,) of length 1, from the record's seed."""
     x = np.random.default_rng([record.seed, 11]).normal(size=3)
     return np.asarray(x / np.linalg.norm(x))
 
@@ -212,7 +215,7 @@ def _upside_down(record: Record) -> None:
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake, where it can be made, and what a finding has to say."""
+    """Mistake, the streams in which it is possible, and the right names and words of a finding."""
 
     plant: Callable[[Record], None]
     streams: tuple[str, ...]
@@ -333,7 +336,7 @@ GOOD: dict[str, dict[str, float]] = {
 
 
 def asked(path: Path) -> list[tuple[str, str]]:
-    """Names and messages of the findings; an error counts as one without a name."""
+    """Return names and messages of the findings; an error counts as one without a name."""
     try:
         return [(found.name, found.message) for found in check_log(path).findings]
     except DrakeTeleopError as error:
@@ -348,7 +351,7 @@ def is_named(mistake: Mistake, found: list[tuple[str, str]]) -> bool:
 
 
 def of_kind(kind: str, streams: str, motion: str, seeds: range, folder: Path) -> dict[str, Any]:
-    """How often a mistake is named."""
+    """Return how often a mistake is named."""
     named, said = 0, []
     for seed in seeds:
         record = make(motion, seed)
@@ -360,7 +363,7 @@ def of_kind(kind: str, streams: str, motion: str, seeds: range, folder: Path) ->
 
 
 def alarms(kind: str, streams: str, motion: str, seeds: range, folder: Path) -> dict[str, Any]:
-    """How many of the good logs are called bad."""
+    """Return how many good logs have a finding."""
     said = [
         asked(written(make(motion, seed, **GOOD[kind]), folder, STREAMS[streams])) for seed in seeds
     ]
@@ -369,7 +372,7 @@ def alarms(kind: str, streams: str, motion: str, seeds: range, folder: Path) -> 
 
 
 def real(data: Path, folder: Path) -> dict[str, Any]:
-    """What is said of real records that are described well."""
+    """Return the findings for real records with correct descriptions."""
     matrix = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     bias = [-0.0037, 0.0088, 0.0771]
     report: dict[str, Any] = {}
@@ -402,14 +405,14 @@ def real(data: Path, folder: Path) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--seed", type=int, default=0, help="the first one of the runs")
-    parser.add_argument("--only", nargs="*", default=[], help="kinds whose name has one of these")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first run (default: 0)")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the names of mistakes")
     parser.add_argument("--streams", nargs="*", default=list(STREAMS))
     parser.add_argument("--motions", default="FP")
     parser.add_argument("--no-good", action="store_true")
     parser.add_argument("--no-bad", action="store_true")
     parser.add_argument("--data", type=Path, help="folder of real records")
-    parser.add_argument("--json", type=Path, help="write the figures and messages here")
+    parser.add_argument("--json", type=Path, help="file for the figures and messages")
     arguments = parser.parse_args()
     cases = [] if arguments.no_bad else [(k, of_kind, KINDS[k].streams) for k in KINDS]
     cases += [] if arguments.no_good else [(k, alarms, ALL) for k in GOOD]

@@ -1,15 +1,15 @@
-"""How does noise of the poses affect the load, and whose intervals are correct?
+"""How does noise of the poses affect the load, and which estimator's intervals are correct?
 
-Records of 60 s of a six-joint arm with the measures of a UR5e: F, Fourier series of 6 s period and
-5 harmonics; P, pick and place, minimum-jerk moves of 0.9 to 1.8 s with rests. A load of 1.7 kg, the
-wrench at 500 Hz with white noise of 0.1 N and 0.004 N m and offsets, stamps of the poses 4 ms late.
-White noise of the poses, or coloured (AR(1)), at several rates; a wrench whose offsets wander; a
-sensor whose gains are wrong. The present chain (zero-phase low-pass, polynomials that slide along)
-is the baseline of the same record.
+Records are 60 s of a six-joint arm with the dimensions of a UR5e: F, Fourier series of 6 s period
+and 5 harmonics; P, pick and place, minimum-jerk moves of 0.9 to 1.8 s with rests. The load is
+1.7 kg. The wrench at 500 Hz has white noise of 0.1 N and 0.004 N m and offsets; the stamps of the
+poses are 4 ms late. Cases have white or coloured (AR(1)) noise of the poses at several rates,
+drifting offsets, or gain errors of the sensor. Baseline for the same record: the chain without
+splines (zero-phase low-pass, sliding polynomials).
 
-Columns: bias and root mean square of the mass's error [g], the bias over the deviation that is
-stated, that deviation [g], the error of the centre of mass [mm], and the share of the ten
-parameters within 1.96 stated deviations; of the new one also the errors of the frame of the poses.
+Columns: bias and root mean square of the mass's error [g]; the bias over the stated deviation; that
+deviation [g]; the error of the centre of mass [mm]; the share of the ten parameters within 1.96
+stated deviations. With splines also the errors of the pose frame.
 
     python benchmarks/pose_noise.py [--runs 6] [--seed 0] [--only NAME ...] [--no-present]
         [--json FILE]
@@ -56,7 +56,7 @@ PHI = phi_from_mass_com_inertia(
 )
 OFFSETS = np.array([3.1, -1.4, 6.0, 0.13, -0.29, 0.06])
 LATE = 0.004
-# Denavit and Hartenberg of a UR5e: a, alpha, d.
+# Denavit-Hartenberg parameters of a UR5e: a, alpha, d.
 _LINKS = (
     *((0.0, np.pi / 2, 0.1625), (-0.425, 0.0, 0.0), (-0.3922, 0.0, 0.0)),
     *((0.0, np.pi / 2, 0.1333), (0.0, -np.pi / 2, 0.0997), (0.0, 0.0, 0.0996)),
@@ -66,14 +66,14 @@ _HOME = np.array([0.0, -1.6, 1.8, -1.8, -1.57, 0.0])
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of record.
+    """Kind of record.
 
     Attributes:
         place, turn: noise of position [m] and orientation [rad], of each pose and axis.
         rate: of the poses [Hz].
         colour: correlation of the poses' noise from one to the next.
         wrench_rate: [Hz].
-        drift: by which the offsets wander in 60 s [N]; torques by 0.04 m of it.
+        drift: drift of the offsets in 60 s [N]; that of torques is 0.04 m of it.
         gain: standard deviation of each entry of the sensor's matrix; it is stated.
         shift: p_SoPo_S [m].
     """
@@ -104,7 +104,7 @@ CASES = {
 
 
 def fourier(rng: np.random.Generator, t: Array) -> tuple[Array, Array, Array]:
-    """q, v, vdot (N, 6): 6 s period, 5 harmonics."""
+    """Return q, v, vdot (N, 6): 6 s period, 5 harmonics."""
     w = 2 * np.pi / 6.0 * np.arange(1, 6)
     a, b = rng.normal(size=(2, 5, 6)) * np.array([0.5, 0.18, 0.22, 0.6, 0.6, 0.8]) / w[:, None]
     s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
@@ -116,7 +116,7 @@ def fourier(rng: np.random.Generator, t: Array) -> tuple[Array, Array, Array]:
 
 
 def pick_and_place(rng: np.random.Generator, t: Array) -> tuple[Array, Array, Array]:
-    """q, v, vdot (N, 6): minimum-jerk moves with rests between."""
+    """Return q, v, vdot (N, 6): minimum-jerk moves with rests between."""
     q, v, vdot = np.zeros((3, len(t), 6))
     now, start = _HOME, 0.3
     q[:] = now
@@ -138,7 +138,7 @@ MOTIONS = {"F": fourier, "P": pick_and_place}
 
 
 def kinematics(q: Array, v: Array, vdot: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """R_WS (N, 3, 3), p (N, 3), and in the world omega, alpha and the acceleration of So."""
+    """Return R_WS (N, 3, 3), p (N, 3), and in W omega, alpha and the acceleration of So."""
     n = len(q)
     R, p = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
     omega, alpha, a = np.zeros((3, n, 3))
@@ -159,14 +159,14 @@ def kinematics(q: Array, v: Array, vdot: Array) -> tuple[Array, Array, Array, Ar
 
 @lru_cache(maxsize=12)
 def moved(motion: str, path: int, wrench_rate: float, rate: float) -> tuple[Array, ...]:
-    """Times of wrench and poses, and `kinematics` at both, one after the other."""
+    """Return times of wrench and poses, and `kinematics` at all of them."""
     t, t_pose = np.arange(0.0, 60.0, 1 / wrench_rate), np.arange(0.0013, 60.0, 1 / rate)
     both = np.concatenate([t, t_pose])
     return t, t_pose, *kinematics(*MOTIONS[motion](np.random.default_rng([path, 7]), both))
 
 
 def record(case: Case, motion: str, seed: int) -> tuple[Array, Array, Poses]:
-    """Times, wrench and poses of one record; 6 trajectories."""
+    """Return times, wrench and poses of one record; there are 6 trajectories."""
     rng = np.random.default_rng([seed, len(motion)])
     t, t_pose, R, p, omega, alpha, a = moved(motion, seed % 6, case.wrench_rate, case.rate)
     n = len(t)
@@ -188,7 +188,7 @@ def record(case: Case, motion: str, seed: int) -> tuple[Array, Array, Poses]:
 
 
 def present(t: Array, wrench: Array, poses: Poses, cutoff: float) -> tuple[Array, Array]:
-    """theta and its deviations by the chain without splines, as `logs.read.reading` has it."""
+    """Return theta and its deviations by the chain without splines, see `logs.read.reading`."""
     even = np.arange(poses.t[0], poses.t[-1], 1 / poses.rate)
     at, dt = resample(even, poses.t, poses.position), 1 / poses.rate
     R = resample(even, poses.t, rotation_matrices(poses.quaternion, "quaternion_wxyz"))
@@ -203,13 +203,13 @@ def present(t: Array, wrench: Array, poses: Poses, cutoff: float) -> tuple[Array
 
 
 def one(case: Case, motion: str, seed: int, chain: str) -> dict[str, Any]:
-    """Errors of a record by a chain."""
+    """Return the errors of a record by a chain."""
     t, wrench, poses = record(case, motion, seed)
     truth = np.concatenate([OFFSETS, PHI])
     start = time.process_time()
     if chain == "new":
         found = estimate_from_poses(
-            t, wrench, poses, GRAVITY_W, p_SoPo_S=case.shift, gain=case.gain
+            t, wrench, poses, GRAVITY_W, p_SoPo_S=case.shift, gain_std=case.gain
         )
         theta, deviations = found.theta, np.sqrt(np.diag(found.covariance))
         turn = Rotation.from_matrix(found.frame.R_SP).as_rotvec(degrees=True)
@@ -241,7 +241,7 @@ def one(case: Case, motion: str, seed: int, chain: str) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of the records of one case and chain."""
+    """Return the statistics of one case and chain."""
     mass, std = (np.array([r[k] for r in rows]) for k in ("mass", "mass_std"))
     z = np.array([r["z"] for r in rows])[:, 6:]
     out: dict[str, Any] = {
@@ -273,11 +273,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=6)
-    parser.add_argument("--seed", type=int, default=0, help="the first one of the runs")
-    parser.add_argument("--only", nargs="*", default=[], help="cases whose name has one of these")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first run (default: 0)")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the names of cases")
     parser.add_argument("--motions", default="FP")
-    parser.add_argument("--no-present", action="store_true", help="the new estimate alone")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--no-present", action="store_true", help="run only the estimate by splines"
+    )
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     report: dict[str, Any] = {"runs": arguments.runs, "seed": arguments.seed}
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
@@ -306,7 +308,7 @@ def main() -> None:
                     ),
                     flush=True,
                 )
-                if arguments.json:  # after each line: the whole takes long
+                if arguments.json:  # after each line, because the whole run takes long
                     arguments.json.write_text(json.dumps(report, indent=2) + "\n")
 
 

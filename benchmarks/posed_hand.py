@@ -1,8 +1,8 @@
 """Hand motion as reported by a robot, for `calibrate.py`: poses of a frame other than S.
 
-Poses at 250 Hz with noise of 0.1 mm and 0.2 mrad, white, late by up to 8 ms; every other load has
-them on another clock than the wrench, and packets take up to 2 ms longer than the fastest. The
-sensor is turned and shifted in the frame that is posed.
+The poses at 250 Hz have white noise of 0.1 mm and 0.2 mrad and a delay up to 8 ms. For every second
+load they have another clock than the wrench, and packets take up to 2 ms longer than the fastest.
+The sensor is rotated and shifted in the frame of the poses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from drake_teleop.robots.streams import POSE, WRENCH, Part
 Array = NDArray[np.float64]
 
 HZ = 500.0
-NOISE = np.repeat([0.25, 0.012], 3) / np.sqrt(2.0)  # N, N m, of the density of 1 kHz
+NOISE = np.repeat([0.25, 0.012], 3) / np.sqrt(2.0)  # N, N m, with the density of 1 kHz
 COLOURS = (0.0, 0.5, 0.9)
 POSE_HZ, POSE_NOISE = 250.0, np.repeat([1e-4, 2e-4], 3)  # m, rad
 CLOCK_S, STEP_S = 5e3, 1e-5
@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 9.81])
 
 
 class Hand:
-    """Angles (z, y, x) and place of S as sums of sines, which begin after half a second of rest."""
+    """Angles (z, y, x) and position of S as sums of sines, after half a second of rest."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rates = rng.uniform(0.2, 1.2, (6, 4)) * 2.0 * np.pi
@@ -39,7 +39,7 @@ class Hand:
         self._middle = rng.uniform(-0.5, 0.5, 6)
 
     def at(self, t: Array) -> tuple[Rotation, Array]:
-        """R_WS and p_WS (N, 3) [m]."""
+        """Return R_WS and p_WS (N, 3) [m]."""
         start = np.clip((t - 0.5) / 1.0, 0.0, 1.0)[:, None]
         start = start**4 * (35.0 - 84.0 * start + 70.0 * start**2 - 20.0 * start**3)
         waves = (self._sizes * np.sin(t[:, None, None] * self._rates + self._phases)).sum(axis=2)
@@ -47,7 +47,7 @@ class Hand:
         return Rotation.from_euler("ZYX", x[:, :3]), x[:, 3:]
 
     def motion(self, t: Array) -> tuple[Array, Array, Array]:
-        """s, omega, alpha in S, by differences of 10 and 100 us."""
+        """Return s, omega, alpha in S, by differences of 10 and 100 us."""
 
         def omega_at(t: Array) -> Array:
             before, after = (self.at(t + h)[0] for h in (-STEP_S, STEP_S))
@@ -62,7 +62,7 @@ class Hand:
 
 
 class Told:
-    """Which streams there are."""
+    """Source without data that lists its streams."""
 
     dt = 1.0 / HZ
 
@@ -78,7 +78,7 @@ class Told:
 
 
 class Played:
-    """Parts as fast as they are taken, each with when it came."""
+    """Source that delivers parts without waiting, each with its time of arrival."""
 
     live = False
 
@@ -95,7 +95,7 @@ class Played:
 
 
 def posed(rng: np.random.Generator, phi: Array, seconds: float) -> tuple[Played, PartRecorder]:
-    """What comes of a load, and who keeps it."""
+    """Return the parts of a load's record, and their recorder."""
     hand = Hand(rng)
     t, late = np.arange(round(seconds * HZ)) / HZ, rng.uniform(0.0, 0.008)
     a = rng.choice(COLOURS)

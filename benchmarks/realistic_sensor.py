@@ -1,13 +1,13 @@
 """How well is a load identified with a realistic JR3, and what remains of the 100 N?
 
 The slave runs the shipped identification; then it swings as in Fig. 6. Both are simulated once at
-8 kHz with an ideal sensor. What that saw goes through the kernels of sensor and motion estimation
-with the noise of 20 seeds; the load is found from the samples at 1 kHz, by total least squares and,
-as the baseline, by least squares; with each load the contact wrench of Eq. (13) is calculated,
-which is the residual, since nothing is touched. `--whole` seeds (3) are simulated as a whole.
+8 kHz with an ideal sensor. The true values pass through the kernels of sensor and motion estimation
+with the noise of 20 seeds. The load is identified from the samples at 1 kHz, by total least squares
+and, as the baseline, by least squares. For each load the contact wrench of Eq. (13) is calculated;
+without contact it is the residual. `--whole` seeds (3) are simulated completely.
 
-Then the sources of error, each alone on a sensor that has no other, with the true load: the median
-of the rms and the largest peak of 20 seeds, of noise or of the sensor's calibration.
+Then each source of error acts alone on an otherwise ideal sensor, with the true load: median of the
+rms and largest peak of 20 seeds of the noise or of the sensor's calibration.
 
     python benchmarks/realistic_sensor.py [--seeds 20] [--whole 3] [--json FILE]
 """
@@ -93,20 +93,20 @@ def _run(chain, chain_memory, estimator, estimator_memory, arm, noise, truth, sa
 
 
 def sampled(
-    sensor: WristSensorConfig, truth: Array, seed: int, believed: WristSensorConfig | None = None
+    sensor: WristSensorConfig, truth: Array, seed: int, assumed: WristSensorConfig | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Wrench, s, omega, alpha at 8 kHz.
+    """Return wrench, s, omega, alpha at 8 kHz.
 
     Args:
-        sensor: what is real.
+        sensor: the true sensor.
         truth: (N, 15 + n).
         seed: of the noise.
-        believed: what the estimation of the motion takes it for.
+        assumed: sensor that the motion estimation assumes (default: the true one).
     """
     n = truth.shape[1] - 15
     chain, memory = initialize_sensor_chain(sensor, n, 1 / RATE)
     motion = initialize_motion_estimator(
-        IDENTIFICATION.motion_estimation, believed or sensor, n, 1 / RATE
+        IDENTIFICATION.motion_estimation, assumed or sensor, n, 1 / RATE
     )
     blocks = len(truth) // SAMPLES_PER_NOISE_BLOCK + 1
     noise = np.random.default_rng(seed).standard_normal((blocks, NOISE_BLOCK_SIZE))
@@ -117,7 +117,7 @@ def sampled(
 
 
 def errors_of(load: Identification) -> Array:
-    """(5,) of `ERRORS`: the worst principal inertia about the centre of mass, norms of the rest."""
+    """Return `ERRORS` (5,): that of the worst principal inertia, and norms of the others."""
     (mass, com, inertia), (true_mass, true_com, true_inertia) = (
         mass_com_inertia(phi) for phi in (load.phi, ARM.phi_load)
     )
@@ -134,7 +134,7 @@ def errors_of(load: Identification) -> Array:
 
 
 def held(load: Identification) -> NDArray[np.bool_]:
-    """(16,) whether the 95 % intervals hold what is true, the offsets at the start."""
+    """Return whether the 95 % intervals (16,) contain the truth, the offsets at the start."""
     low, high = confidence_intervals(load)
     true = np.concatenate([JR3.offset, ARM.phi_load])
     return np.asarray((low <= true) & (true <= high))
@@ -157,7 +157,7 @@ ESTIMATORS: dict[str, Callable[..., Identification]] = {
 def identified(
     name: str, motion: Array, seed: int, sensor: WristSensorConfig = JR3
 ) -> Identification:
-    """The load that one seed gives."""
+    """Return the load of one seed."""
     samples = sampled(sensor, motion, seed)
     scenario = scenarios.replace(IDENTIFICATION, wrist_sensor=sensor)
     return ESTIMATORS[name](scenario, *(signal[::EVERY] for signal in samples))
@@ -169,17 +169,17 @@ def residual(
     seed: int,
     offsets: Array,
     phi: Array = ARM.phi_load,
-    believed: WristSensorConfig | None = None,
+    assumed: WristSensorConfig | None = None,
 ) -> tuple[float, float, float]:
-    """What elimination leaves: rms and peak of the force [N], rms of the torque [N m]."""
-    wrench, s, omega, alpha = sampled(sensor, swing, seed, believed)
+    """Return the residual: rms and peak of the force [N], rms of the torque [N m]."""
+    wrench, s, omega, alpha = sampled(sensor, swing, seed, assumed)
     left = contact_wrench(wrench, offsets, s, omega, alpha, phi)
     force, torque = (np.linalg.norm(part, axis=1) for part in (left[:, :3], left[:, 3:]))
     return float(np.sqrt(np.mean(force**2))), float(force.max()), float(np.sqrt(np.mean(torque**2)))
 
 
 def study(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, float]]:
-    """By estimator: medians of the errors, share of the intervals that hold, the residual."""
+    """Return by estimator medians of the errors, share of the intervals that hold, the residual."""
     rows = {}
     for name in ESTIMATORS:
         found = [identified(name, motion, seed) for seed in range(seeds)]
@@ -201,7 +201,7 @@ def study(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, float]
 
 
 def whole(trajectory: FourierTrajectory, seeds: int) -> dict[str, dict[str, float]]:
-    """The same by whole simulations, with the estimate of the loop."""
+    """Return the same by complete simulations, with the estimate in the loop."""
     rows = {}
     for seed in range(seeds):
         scenario = scenarios.replace(IDENTIFICATION, simulation__seed=seed)
@@ -221,9 +221,9 @@ def whole(trajectory: FourierTrajectory, seeds: int) -> dict[str, dict[str, floa
 
 
 def same_samples(trajectory: FourierTrajectory, motion: Array) -> float:
-    """Largest difference of a whole simulation's samples from the kernels', in shares of the rms.
+    """Return the largest difference of a simulation's samples from the kernels', over the rms.
 
-    Without noise, which the two draw from different sources.
+    There is no noise, because the two draw it from different sources.
     """
     sensor = without_parts(JR3, "noise", "random_walk")
     scenario = scenarios.replace(IDENTIFICATION, wrist_sensor=sensor, rates__log_hz=RATE)
@@ -236,7 +236,7 @@ def same_samples(trajectory: FourierTrajectory, motion: Array) -> float:
 
 
 def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, float]]:
-    """Each source of error alone; `all` adds them up, with the true load and with a found one."""
+    """Return figures of each source of error alone; `all` is their sum, with two loads."""
     nothing = without_parts(JR3, *(part for part in PARTS if part not in ("place", "saturation")))
     wrench, motion_noise = (
         ("force_noise", "torque_noise"),
@@ -267,7 +267,7 @@ def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, floa
             name: wrong[name] for name in ("acceleration_gain_error", "acceleration_misalignment")
         },
     }
-    # The low-pass belongs to the noise: what it takes away is not felt.
+    # The low-pass belongs to the noise: it reduces the displayed noise.
     filtered = ("noise of the wrench", "noise of the accelerations", "quantisation, encoders too")
     rows = {}
     for name, fields in alone.items():
@@ -279,7 +279,7 @@ def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, floa
     for name, late in ((f"accelerations {1e3 * LATE:g} ms late", LATE), ("6 ms late", 6e-3)):
         sensor = replace(nothing, acceleration_latency=late)
         rows[name] = over_seeds(
-            lambda seed, s=sensor: residual(s, swing, seed, np.zeros(6), believed=nothing), 1
+            lambda seed, s=sensor: residual(s, swing, seed, np.zeros(6), assumed=nothing), 1
         )
 
     def found(sensor: WristSensorConfig, seed: int) -> Identification:
@@ -325,8 +325,8 @@ def over_seeds(left: Callable[[int], tuple[float, float, float]], seeds: int) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--whole", type=int, default=3, help="seeds that are simulated as a whole")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--whole", type=int, default=3, help="seeds that are simulated completely")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     motion, swing, trajectory = true_motions()
     peak = float(np.linalg.norm(swing[:, :3], axis=1).max())

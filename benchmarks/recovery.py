@@ -1,11 +1,11 @@
 """Does every method recover from every random network within its force limit?
 
 `python benchmarks/recovery.py [--json FILE] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
-`lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
-up to 100 %, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's
-0.1 s. At 4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A
-method has recovered if at the end the slave is within 2 mm of the hand, which is at rest within
-0.5 mm and feels less than 0.1 N. The force may never be above 5 N, and may never step up by more
+`lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter up to 100
+%, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's 0.1 s. At
+4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A method
+has recovered if at the end the slave is within 2 mm of the hand. The hand must be at rest within
+0.5 mm, and the displayed force below 0.1 N. The force must never exceed 5 N, nor step up by more
 than 0.5 N in the first 0.5 s after a silence.
 """
 
@@ -49,25 +49,25 @@ GOOD_FROM, TIMEOUT, LIMIT = 4.5, 0.1, 5.0  # s, s, N
 
 @dataclasses.dataclass
 class Row:
-    """What a method did over all networks; of the figures the worst."""
+    """Figures of a method over all networks: the worst values."""
 
     method: str
     runs: int = 0
     recovered: int = 0
     silences: int = 0
-    beside: float = 0.0  #: slave beside the hand, last half second [m]
-    at_rest: float = 0.0  #: force that the hand feels then [N]
-    largest: float = 0.0  #: force ever felt [N]
-    step: float = 0.0  #: by how much it grew from step to step just after a silence [N]
+    beside: float = 0.0  #: distance of slave and hand in the last half second [m]
+    at_rest: float = 0.0  #: displayed force in that time [N]
+    largest: float = 0.0  #: largest displayed force [N]
+    step: float = 0.0  #: largest step of the force just after a silence [N]
 
     def add(self, run: OneDofRun) -> None:
-        """Counts one run."""
-        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.felt)
-        beside = float(np.abs(run.slave - run.master)[end].max())
+        """Count one run."""
+        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.hand_force)
+        beside = float(np.abs(run.slave_position - run.master_position)[end].max())
         at_rest = float(felt[end].max())
-        still = np.ptp(run.master[end]) < 0.5e-3
+        still = np.ptp(run.master_position[end]) < 0.5e-3
         self.runs += 1
-        self.recovered += bool(beside < 2e-3 and at_rest < 0.1 and still)  # never if not finite
+        self.recovered += bool(beside < 2e-3 and at_rest < 0.1 and still)  # False if not finite
         silent = run.time_without_packets[:, 0] > TIMEOUT
         grown = np.diff(felt, prepend=0.0)[_resuming(silent)]
         self.silences += int((np.diff(silent.astype(int)) < 0).sum())
@@ -77,26 +77,26 @@ class Row:
         self._raise(worst)
 
     def join(self, other: Row) -> None:
-        """Adds what another process has counted."""
+        """Add the counts of another process."""
         for name in ("runs", "recovered", "silences"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self._raise(dataclasses.asdict(other))
 
     def _raise(self, found: dict[str, float]) -> None:
         for name in ("beside", "at_rest", "largest", "step"):
-            # The order matters: what is not a number stays.
+            # The order matters: NaN is kept.
             setattr(self, name, float(np.maximum(found[name], getattr(self, name))))
 
 
 def _resuming(silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The steps up to RESUME_TIME_S after a silence."""
+    """Return flags of the steps up to RESUME_TIME_S after a silence."""
     steps = np.arange(len(silent))
     since = steps - np.maximum.accumulate(np.where(silent, steps, -len(silent)))
     return (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
 
 
 def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:
-    """A line that is as bad as can be until GOOD_FROM; written as a trace of every millisecond."""
+    """Return a very bad line until GOOD_FROM, as a trace of every millisecond."""
     steps = round(GOOD_FROM / PERIOD)
     mean, jitter = rng.uniform(0.0, 0.3), rng.uniform()
     delay = mean * (1.0 + jitter * rng.uniform(-1.0, 1.0, steps))
@@ -117,7 +117,7 @@ def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:
 
 
 def _some_networks(job: tuple[int, int]) -> list[Row]:
-    """Every method over the networks first..last-1."""
+    """Run every method over the networks first..last-1."""
     rows, intent = [Row(method) for method in METHODS], operator_intent(TASK)
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{way}.csv" for way in range(2)]
@@ -133,7 +133,7 @@ def _some_networks(job: tuple[int, int]) -> list[Row]:
 
 
 def study(networks: int, processes: int = 2) -> list[Row]:
-    """Runs every method over the networks."""
+    """Run every method over the networks."""
     share = max(1, -(-networks // (16 * processes)))
     jobs = [(first, min(first + share, networks)) for first in range(0, networks, share)]
     run_one_dof(REFERENCE, PassivityConfig(), NetworkConfig())  # compiles, before processes fork
@@ -150,7 +150,7 @@ def study(networks: int, processes: int = 2) -> list[Row]:
 
 
 def holds(rows: list[Row]) -> bool:
-    """Whether every method recovered every time and kept within its limits."""
+    """Return whether every method recovered every time and kept its limits."""
     return all(
         row.recovered == row.runs and row.largest <= LIMIT + 1e-12 and row.step < 0.5
         for row in rows
@@ -158,10 +158,12 @@ def holds(rows: list[Row]) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the study and prints it; returns 0 if `holds`."""
+    """Run and print the study; return 0 if `holds`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument(
+        "--networks", type=int, default=10_000, help="number of networks (default: 10000)"
+    )
     options = parser.parse_args(arguments)
     began = time.monotonic()
     rows = study(options.networks)

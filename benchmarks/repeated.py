@@ -1,14 +1,14 @@
-"""Does a drive with every change repeat to the last bit, however it is divided?
+"""Does a drive with every change repeat to the last bit, with slices of any length?
 
     python benchmarks/repeated.py [--seconds 60] [--json FILE]
 
-A script taps and presses on the leaf of `touch` and moves every slider all the while; the clutch
-is opened and closed, the hand lets go, another grip, sensor, method and network are chosen (and
-its delay, jitter and loss), contact is detected for a while, an object is grasped and put down. It
-is driven as the server does it, in slices of 5 ms, with its log on the disk; then `repeat` has only
-the record. `same_bytes`: of the log's files, cut as it was driven. `differ_`: numbers of the log
-that are others, cut into slices of 1, 7 and 1000 ms.
-Baseline: `differ_late`, numbers that are others within a second if one input comes 1 ms later.
+A script taps and presses on the leaf of `touch` and moves every slider all the time. It opens and
+closes the clutch, lets go, and chooses another grip, sensor, method and network (with delay, jitter
+and loss); contact is detected for a while, an object is grasped and released. The drive runs as in
+the server, in slices of 5 ms, with its log on the disk. Then `repeat` runs from the record alone.
+`same_bytes`: whether the log's files are equal for the same slices. `differ_`: different numbers in
+the log, for slices of 1, 7 and 1000 ms.
+Baseline: `differ_late`, different numbers within a second if one input comes 1 ms later.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
-#: Choices, and from which share of the drive on they hold.
+#: Choices, and the share of the drive from which they hold.
 STATION_INPUTS = (
     (0.10, {"object": 1}),
     (0.20, {"detection": 1}),
@@ -50,7 +50,7 @@ STATION_INPUTS = (
 
 
 def wanted(now: Inputs, ms: int, end: int) -> Inputs:
-    """What the script wants at a time [ms]."""
+    """Return the inputs at a time [ms]."""
     t, share = 1e-3 * ms, ms / end
     down, sway = 0.5 - 0.5 * np.cos(2 * np.pi * 0.5 * t), np.sin(2 * np.pi * 0.3 * t)
     other = np.cos(2 * np.pi * 0.2 * t)
@@ -66,7 +66,7 @@ def wanted(now: Inputs, ms: int, end: int) -> Inputs:
 
 
 def driven(seconds: float, folder: Path) -> None:
-    """A drive as a page makes one, recorded with its log."""
+    """Record a drive with its log, as a page does."""
     scenario = live_scenario(LoadScenario("touch"))
     load = identified_load(scenario)
     session = Session(scenario, load, log=folder / "log.parquet", record=folder)
@@ -80,7 +80,7 @@ def driven(seconds: float, folder: Path) -> None:
 
 
 def begun(drive: RecordedDrive, late: int) -> SimulationResult:
-    """The log of the first hundred changes, of which the 20th comes late [ms]."""
+    """Return the log of the first hundred changes, of which the 20th comes late [ms]."""
     changes = list(drive.changes[:100])
     ms, inputs = changes[20]
     changes[20] = ms + late, inputs
@@ -88,7 +88,7 @@ def begun(drive: RecordedDrive, late: int) -> SimulationResult:
 
 
 def differ(one: SimulationResult, other: SimulationResult) -> int:
-    """How many numbers of two logs are not the same bits; all, if they have not the same form."""
+    """Return how many numbers of two logs have different bits; all if their shapes differ."""
     count = 0
     for name in ("t", *one):
         a, b = (np.ascontiguousarray(log[name]) for log in (one, other))
@@ -98,7 +98,7 @@ def differ(one: SimulationResult, other: SimulationResult) -> int:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", type=Path)

@@ -2,16 +2,17 @@
 
 `python benchmarks/replayed.py [--json FILE] [--data FOLDER] [LOG ...]` replays logs in chunks of
 one reading, of 7, of 256 and of all, delayed and predicted, and counts the numbers that differ in
-any bit. The logs are the sample log's two, all records of NTNU, UR5 and UTIAS in FOLDER, and those
-named, such as sensor_log.parquet of `drake-teleop run`. The load is what `identify` finds in the
-log, and for NTNU what it finds in the 24 poses at rest; where it finds none, one of 1 kg: the
-comparison needs no true one.
+any bit. The logs are the two of the sample log, all records of NTNU, UR5 and UTIAS in FOLDER, and
+those in the arguments, such as sensor_log.parquet of `drake-teleop run`. The load is that of
+`identify` for the log, and for NTNU that of the 24 poses at rest. If there is none, it is 1 kg: the
+comparison does not need the true one.
 
-Then the force that is left, rms: of the records of NTNU, in which nothing touches the robot, at
-30 Hz, with three kinds of offsets, each zero-phase (`eliminate`) and live: the record's own, those
-of a tare in its first half second, those of the load file. Only like is to be compared with like:
-the zero-phase 0.30 and 0.32 N of the docs are with the record's own. Of the logs named, as
-"removed": the share of the force without offsets that is gone where `eliminate` sees no contact.
+The second figure is the rms residual force at 30 Hz, for records of NTNU without contact. There are
+three kinds of offsets, each zero-phase (`eliminate`) and live: the record's own, those of a tare in
+its first half second, those of the load file. Compare only figures with equal offsets: the
+zero-phase 0.30 and 0.32 N of the docs have the record's own. For the logs in the arguments,
+"removed" is the share of the force without offsets that is removed where `eliminate` has no
+contact.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ ANY = Identification(
 
 
 class Kept(list[CompensatedWrench]):
-    """A sink."""
+    """Sink that stores the results."""
 
     def write(self, out: CompensatedWrench) -> None:
         """See `Sink`."""
@@ -58,7 +59,7 @@ class Kept(list[CompensatedWrench]):
 
 
 def replayed(path: Path, load: Identification, chunk: int, mode: str) -> Kept:
-    """What `compensate` makes of a log where it was measured."""
+    """Return the output of `compensate` for a log at its measured instants."""
     source, kept = ReplayLogSource(path, load, chunk=chunk), Kept()
     late = {"wait": source.wait, "predicted": mode == "predicted"}
     compensate_stream(source, Compensator(load, source.dt, sigma=0.3, gamma=1.5, **late), kept)  # type: ignore[arg-type]
@@ -66,7 +67,7 @@ def replayed(path: Path, load: Identification, chunk: int, mode: str) -> Kept:
 
 
 def differing(path: Path, load: Identification) -> tuple[int, int]:
-    """How many numbers were compared, and how many differ."""
+    """Return how many numbers were compared, and how many differ."""
     compared = different = 0
     for mode in ("delayed", "predicted"):
         wanted = eliminate_log(path, load, sigma=0.3, gamma=1.5, causal=mode)
@@ -82,12 +83,12 @@ def differing(path: Path, load: Identification) -> tuple[int, int]:
 
 
 def rms(contact: np.ndarray) -> float:
-    """Of the force [N]."""
+    """Return the rms of the force [N]."""
     return float(np.sqrt((contact[:, :3] ** 2).sum(axis=1).mean()))
 
 
 def left(path: Path, load: Identification) -> dict[str, float]:
-    """Force that is left of a record without contact, with three kinds of offsets."""
+    """Return the residual force of a record without contact, with three kinds of offsets."""
 
     def of(**options: Any) -> EliminatedLog:
         return eliminate_log(path, load, causal="delayed", **options)
@@ -106,7 +107,7 @@ def left(path: Path, load: Identification) -> dict[str, float]:
 
 
 def removed(path: Path, load: Identification) -> float:
-    """Share of the force that is gone where `eliminate` sees no contact."""
+    """Return the removed share of the force where `eliminate` has no contact."""
     found = eliminate_log(path, load, causal="delayed", causal_tare_s=TARE_REST_S)
     assert found.causal is not None
     free = ~found.touched
@@ -114,7 +115,7 @@ def removed(path: Path, load: Identification) -> float:
 
 
 def ur5(data: Path, folder: Path) -> Iterator[Path]:
-    """Descriptions of the two records of a UR5 that have a wrench."""
+    """Return descriptions of the two records of a UR5 that have a wrench."""
     for record in ("No9_Singularity_Free_ForceSensor", "No10_Standstill_ForceSensor_All2"):
         files = {
             name: {"file": str(data / f"{record}__{name}.csv"), "header": False, "time": time}
@@ -133,7 +134,7 @@ def ur5(data: Path, folder: Path) -> Iterator[Path]:
 
 
 def utias(data: Path, folder: Path) -> Iterator[Path]:
-    """The tools of UTIAS as canonical logs."""
+    """Return the tools of UTIAS as canonical logs."""
     from utias import load as tool
 
     for file in sorted(data.glob("*.npz")):
@@ -145,7 +146,7 @@ def utias(data: Path, folder: Path) -> Iterator[Path]:
 
 
 def poses_of(records: Path, folder: Path) -> Identification:
-    """The load of NTNU's poses at rest."""
+    """Return the load of NTNU's poses at rest."""
     static = {
         "file": str(records / "0-calibration_fts-accel.csv"),
         "force": {"columns": ["fx", "fy", "fz"], "unit": "N"},
@@ -158,7 +159,7 @@ def poses_of(records: Path, folder: Path) -> Identification:
 
 
 def load_of(path: Path) -> Identification:
-    """What `identify` finds, or any."""
+    """Return the load by `identify`, or one of 1 kg."""
     try:
         return identify_log(path).identification
     except DrakeTeleopError:
@@ -167,9 +168,9 @@ def load_of(path: Path) -> Identification:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real records")
-    parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="more logs")
+    parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="additional logs")
     options = parser.parse_args()
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:

@@ -5,11 +5,12 @@
 noise of wrench and pose, offsets, poses late by up to 8 ms), receive the contact wrench, and call
 the services.
 
-* processing: from the arrival of the first message in Python to the end of the publications that
-  follow, for each of them, by the clock and in time of the thread (without waits for a core);
+* processing: from the arrival of the first message in Python to the end of each publication that
+  follows, by the clock and in thread time (without waits for a core);
   echo: from the stamp of sending to the callback of the receiver, by the clock.
-* calibrations: numbers of which the truth is inside the 95 % and the 99.98 % interval, and within
-  the tolerance; a calibration holds if all its numbers are inside the latter, by which it stops.
+* calibrations: share of numbers whose truth is inside the 95 % and the 99.98 % interval, and within
+  the tolerance. A calibration is right if all its numbers are inside the latter, its stop
+  criterion.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
 def table(rng: np.random.Generator, phi: Array, hz: float) -> Array:
-    """(N, 13) wrench and pose of a hand-moved tool."""
+    """Return wrench and pose (N, 13) of a hand-moved tool."""
     hand, t = Hand(rng), np.arange(round(TABLE_S * hz)) / hz
     noise = NOISE * np.sqrt(hz / 500.0) * rng.normal(size=(len(t), 6))
     offsets = rng.normal(size=6) * np.repeat([5.0, 0.3], 3)
@@ -64,14 +65,14 @@ def table(rng: np.random.Generator, phi: Array, hz: float) -> Array:
 
 
 def identification(phi: Array) -> Identification:
-    """A load, as if it had been identified."""
+    """Return a load, as if it had been identified."""
     known = np.ones(16, dtype=bool)
     zero = np.zeros(6)
     return Identification(phi, zero, np.eye(16) * 1e-6, known, 1.0, 0.0, zero, "given", 1)
 
 
 def started(stack: ExitStack, *words: str, **options: Any) -> subprocess.Popen[str]:
-    """A process that ends with the stack."""
+    """Start a process that ends with the exit stack."""
     process = subprocess.Popen([sys.executable, *words], text=True, **options)
     stack.callback(process.wait)
     stack.callback(process.kill)
@@ -79,12 +80,12 @@ def started(stack: ExitStack, *words: str, **options: Any) -> subprocess.Popen[s
 
 
 def peer(stack: ExitStack, *words: str, **options: Any) -> subprocess.Popen[str]:
-    """A node in another process."""
+    """Start a node in another process."""
     return started(stack, str(PEER), *words, stdout=subprocess.PIPE, **options)
 
 
 def processing(folder: Path, seconds: float) -> dict[str, float]:
-    """Times of one pass of the loop, and of the way to the receiver."""
+    """Return the times of one pass of the loop, and of the path to the receiver."""
     from drake_teleop.robots.compensate import compensate_stream
     from drake_teleop.robots.compensator import Compensator
     from drake_teleop.robots.connections import open_sink, open_source
@@ -145,7 +146,7 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
 
 
 class Tables:
-    """The node of a moving tool, and the loads that it shows one after another."""
+    """Node of a moving tool, with one load after another."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self.path, self.count = folder / "rows.npy", 0
@@ -154,7 +155,7 @@ class Tables:
         assert moving.stdout is not None and moving.stdout.readline()
 
     def next(self) -> None:
-        """The next load, after the second that the node takes to see it."""
+        """Publish the next load, after the second that the node takes to notice it."""
         rng = np.random.default_rng([self.count, 53])
         self.phi, self.count = load_of(rng), self.count + 1
         np.save(self.path.with_name("new.npy"), table(rng, self.phi, HZ))
@@ -162,7 +163,7 @@ class Tables:
         time.sleep(1.5)
 
     def judged(self, found: Identification) -> NDArray[np.bool_]:
-        """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
+        """Return flags (3, k): number within 95 % interval, 99.98 % interval, and tolerance."""
         tolerance = parse_tolerance(UNTIL)
         half, wide, _ = half_widths_over_tolerances(
             SimpleNamespace(identification=found), tolerance
@@ -173,7 +174,7 @@ class Tables:
 
 
 def counted(name: str, inside: list[NDArray[np.bool_]], loads: int) -> dict[str, float]:
-    """Figures of some calibrations."""
+    """Return the figures of some calibrations."""
     held = np.array(inside)
     figures = {"loads": loads, "known": len(held), "inside_95": held[:, 0].mean()}
     figures["inside_all_intervals"] = held[:, 1].all(axis=1).sum()
@@ -182,7 +183,7 @@ def counted(name: str, inside: list[NDArray[np.bool_]], loads: int) -> dict[str,
 
 
 def calibrations(folder: Path, loads: int) -> dict[str, float]:
-    """Counts over calibrations from topics, each of another load."""
+    """Return the counts over calibrations from topics, each of another load."""
     from drake_teleop.robots.calibration import calibrate
     from drake_teleop.robots.connections import open_source_and_recorder
 
@@ -215,7 +216,7 @@ def calibrations(folder: Path, loads: int) -> dict[str, float]:
 
 
 def services(folder: Path, loads: int) -> dict[str, float]:
-    """Counts over calibrations by the service of one running node."""
+    """Return the counts over calibrations by the service of one running node."""
     inside: list[NDArray[np.bool_]] = []
     with ExitStack() as stack:
         load = folder / "load.json"
@@ -245,10 +246,14 @@ def services(folder: Path, loads: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--loads", type=int, default=50, help="calibrations from topics")
-    parser.add_argument("--services", type=int, default=2, help="calibrations by the service")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the measured loop")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--loads", type=int, default=50, help="number of calibrations from topics")
+    parser.add_argument(
+        "--services", type=int, default=2, help="number of calibrations by the service"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="duration of the measured loop [s]"
+    )
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         figures = processing(Path(folder), options.seconds) if options.seconds else {}

@@ -2,11 +2,12 @@
 
 `python benchmarks/shortest.py [--json FILE] [--restarts 20] [--records 50]` designs it for the
 shipped station's arm and "mass 0.1 %, com 0.1 mm, inertia 1 %" from 20 seeds, and prints how much
-longer each is than the shortest of them. Then the first of them is executed 50 times: what the
-sensor's chain and the motion estimation of the station make of it at 8 kHz, noise, random walks and
-quantisation, none of the errors of calibration, is identified by weighted least squares with the
-stated noise, and counted is how often all ten numbers are within their tolerances. The aim is 95 %.
-Baseline: the period of `excite` by default, 6 s, and the share that a motion reaches which is run a
+longer each is than the shortest of them. Then the first motion is executed 50 times. The station's
+sensor chain and motion estimation give its samples at 8 kHz, with noise, random walks and
+quantisation, without calibration errors. Weighted least squares with the stated noise identifies
+the
+load; the figure is the share of records in which all ten numbers are within their tolerances. The
+aim is 95 %. Baseline: the default period of `excite`, 6 s, and the share for a motion that is a
 fifth faster.
 """
 
@@ -53,7 +54,7 @@ ASKED = "mass 0.1 %, com 0.1 mm, inertia 1 %"
 
 @njit
 def record(constants, memory, estimator, remembered, table, truth, noise, samples):
-    """The sensor's chain and the motion estimation, over a whole record."""
+    """Return the samples of sensor chain and motion estimation over a whole record."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
         read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading)
@@ -67,7 +68,7 @@ def reached(
     tolerance: Tolerance,
     records: int,
 ) -> float:
-    """Share of the records in which all asked numbers are within their tolerances."""
+    """Return the share of the records with all required numbers within their tolerances."""
     sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
@@ -95,7 +96,7 @@ def reached(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--restarts", type=int, default=20)
     parser.add_argument("--records", type=int, default=50)
     options = parser.parse_args()

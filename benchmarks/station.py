@@ -1,11 +1,12 @@
 """What does the station cost over its bare plant, and how fast and accurate is it?
 
-Bare plant: arm and tool under a constant torque, nothing around them, in steps of 125 us by the
-second-order Runge-Kutta method. All run interleaved in this process; times are thread CPU time, so
-a busy machine matters little. "contact" is the mean over the whole of the shipped scenario, in
-which the tool bounces on the leaf; "pressed" never leaves it. "in_slot" is the tool as a peg that
-slides down into the slot and stands there, with up to four contacts at once. What `ledger` costs is
-over the same station with the method `none`, both over the network `lan`.
+The bare plant is arm and tool under a constant torque, without environment, in steps of 125 us by
+the second-order Runge-Kutta method. All stations run interleaved in this process; times are thread
+CPU time, so a busy machine matters little. "contact" is the mean over the whole of the shipped
+scenario, in which the tool bounces on the leaf; "pressed" stays on it. "in_slot" is the tool as a
+peg
+that slides down into the slot and stays there, with up to four contacts at once. The cost of
+`ledger` is over the same station with the method `none`, both over the network `lan`.
 
     python benchmarks/station.py [--ledger] [--json FILE]
 """
@@ -43,8 +44,8 @@ _TOGETHER = 12.0  # simulated seconds, long enough for two processes to start at
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--ledger", action="store_true", help="only what ledger costs")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--ledger", action="store_true", help="measure only the cost of ledger")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     free, contact = LoadScenario("free_motion_force"), LoadScenario("contact_transition")
     if arguments.ledger:
@@ -68,7 +69,7 @@ def main() -> None:
 
 
 def finish(figures: dict[str, float], file: Path | None) -> None:
-    """Prints the figures, and writes them if they are wanted."""
+    """Print the figures, and write them if `file` is given."""
     for name, figure in figures.items():
         print(f"{name:50s} {figure:10.4g}")
     if file:
@@ -76,7 +77,7 @@ def finish(figures: dict[str, float], file: Path | None) -> None:
 
 
 def pressed(contact: Scenario) -> Scenario:
-    """The tool goes down onto the leaf during the settling time, and presses."""
+    """Return a scenario in which the tool moves onto the leaf during settling, and presses."""
     return replace(
         contact,
         simulation__settle=1.0,
@@ -85,12 +86,12 @@ def pressed(contact: Scenario) -> Scenario:
 
 
 def joint_control_10_khz(scenario: Scenario) -> Scenario:
-    """With the paper's rate of the joint control."""
+    """Return the scenario with the paper's rate of the joint control."""
     return replace(scenario, rates__joint_control_hz=10000.0)
 
 
 def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]:
-    """CPU time over that of the bare plant; each piece of a motion at its fastest repeat."""
+    """Return CPU time over that of the bare plant; each piece counts at its fastest repeat."""
     scenarios = {
         "free_motion": free,
         "contact": contact,
@@ -108,11 +109,11 @@ def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]
 
 
 def ledger_over_none(free: Scenario, contact: Scenario) -> dict[str, float]:
-    """CPU time with `ledger` over that with `none`, on the same network.
+    """Return CPU time with `ledger` over that with `none`, on the same network.
 
-    In free motion, and pressing on a leaf of 0.5 kN/m, on which both rest. On the shipped leaf, six
-    times as stiff, the tool slides to and fro with `none`, with `ledger` it rests, and friction
-    that sticks takes the integrator three times as many steps.
+    The cases are free motion, and a press on a leaf of 0.5 kN/m, on which both are at rest. On the
+    shipped leaf, six times as stiff, the tool oscillates with `none` and rests with `ledger`, and
+    sticking friction takes the integrator three times as many steps.
     """
     duration, figures = contact.simulation.duration, {}
     soft = replace(pressed(contact), sheet_spring__thickness=8e-4)
@@ -134,7 +135,7 @@ def ledger_over_none(free: Scenario, contact: Scenario) -> dict[str, float]:
 
 
 def fastest(makes: dict[str, Callable[[], Simulator]], duration: float) -> dict[str, float]:
-    """CPU time of a simulated second, each piece of the motion at its fastest repeat."""
+    """Return the CPU time of a simulated second; each piece counts at its fastest repeat."""
     best = {name: np.full(_PIECES, np.inf) for name in makes}
     for _ in range(_REPEATS):
         simulators = {name: make() for name, make in makes.items()}
@@ -152,7 +153,7 @@ def _cpu(simulator: Simulator, span: float) -> float:
 
 
 def rates(free: Scenario) -> dict[str, float]:
-    """Simulated over CPU time, by the sensor's rate."""
+    """Return simulated over CPU time, by the sensor's rate."""
     sensors = {
         "8_khz": free,
         "2_khz": replace(free, rates__sensor_hz=2000.0),
@@ -165,10 +166,10 @@ def rates(free: Scenario) -> dict[str, float]:
 
 
 def two_processes() -> float:
-    """How much more two processes simulate than one, by wall clock."""
+    """Return how much more two processes simulate than one, by the clock."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
-        list(pool.map(_run_alone, [0.1, 0.1]))  # imports and compiled code are there
+        list(pool.map(_run_alone, [0.1, 0.1]))  # imports are done and compiled code is cached
         alone = pool.submit(_run_alone, _TOGETHER).result()
         together = list(pool.map(_run_alone, [_TOGETHER] * 2))
     return 2 * alone / max(together)
@@ -182,12 +183,12 @@ def _run_alone(seconds: float) -> float:
 
 
 def against_the_port(scenario: Scenario) -> float:
-    """Largest difference of the ideal sensor's force from the plant's reaction port, same state."""
+    """Return the largest difference of the ideal sensor's force from the plant's reaction port."""
     scenario = replace(scenario, wrist_sensor__ideal=True)
     simulator = MakeMovingStation(scenario)
     station, context = simulator.get_system(), simulator.get_context()
     plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
-    # What hangs on the body that carries S, each by a weld of its own.
+    # The load on the body that carries S; each part has a weld.
     indices = list(plant.GetJointIndices())
     S = plant.GetFrameByName(scenario.slave.sensor_frame)
     welds = [
@@ -206,15 +207,15 @@ def against_the_port(scenario: Scenario) -> float:
             (R_SW @ frame.CalcPoseInWorld(of_plant).rotation()) @ forces[place].translational()
             for place, frame in welds
         )
-        simulator.AdvancePendingEvents()  # the sensor's sample of this instant
+        simulator.AdvancePendingEvents()  # the sensor's sample at this time
         sample = sensor.GetMyContextFromRoot(context).get_discrete_state_vector().value()
         largest = max(largest, float(np.abs(sample[:3] - port).max()))
     return largest
 
 
 def against_a_tight_run(scenario: Scenario, **changes: object) -> float:
-    """Largest difference of the ideal sensor's force from a run with an accuracy of 1e-10."""
-    # The hand feels the tool: no load need be known.
+    """Return the largest difference of the force from a run with accuracy 1e-10."""
+    # sigma = 1, so that no load is needed.
     scenario = replace(scenario, wrist_sensor__ideal=True, force_scaling__sigma=1.0)
     wrenches = []
     for variant in (replace(scenario, **changes), replace(scenario, **_TIGHT)):

@@ -1,15 +1,16 @@
 """Do stations of other arms and devices fulfil the figures of the paper's station?
 
-For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
-finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and
-of sigma times the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz;
-the largest force of contact, without which a wall shows nothing; CPU time over the station's own
-bare plant, alone and with what it touches; simulated over CPU time.
+For each cell: the ideal sensor's force against the plant's reaction port; the mass from `identify`,
+and the residual after elimination over the peak inertial force; the displayed device and sigma
+times
+the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz; the largest
+contact force, without which a wall is not tested; CPU time over the station's own bare plant, in
+free motion and in contact; simulated over CPU time.
 
     python benchmarks/stations.py [--arms A,...] [--devices D,...] [--models DIR] [--json FILE]
 
-An arm that is not the RX90 moves half as far. Those of Franka and Universal Robots are looked for
-in the package example-robot-data (the extra `bench`), or in --models, its folder of robots.
+Arms other than the RX90 move half as far. Those of Franka and Universal Robots are in the package
+example-robot-data (the extra `bench`), or in --models, its folder of robots.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
-_DEEP = 0.005  # m, so far below the leaf is the tip's lower turn, as in Fig. 8
-_BEFORE = np.array([0.068, 0.0, -0.05])  # m, from the tip at the start to the block's foot
+_DEEP = 0.005  # m, depth of the tip's lower turning point in the leaf, as in Fig. 8
+_BEFORE = np.array([0.068, 0.0, -0.05])  # m, from the tip at the start to the foot of the block
 _SCENARIOS = {
     "free motion": "free_motion_force",
     "wall": "contact_transition",
     "moving block": "push_block",
 }
-_REACH = 0.1  # m, how far the scenarios' intents lead from their start
-_LEADERS = 0.15  # m, the size of what the leader reaches around its home
+_REACH = 0.1  # m, largest displacement of the scenarios' intents from their start
+_LEADERS = 0.15  # m, workspace of the leader around its home
 _LEADER = Leader(
     file=str(models_dir() / "leader_arm.urdf"),
     hand_frame="hand",
@@ -60,7 +61,7 @@ _LEADER = Leader(
     friction=[0.01],
 )
 
-#: Besides the RX90 and its copy on a rail: file, and what else it takes.
+#: Arms besides the RX90 and its copy on a rail: file and other fields.
 _PEG = Tool(mass=1.5, com=[0.01, 0.0, 0.06], shapes=[Ball(0.012, [0.0, 0.0, 0.188])])
 ARMS = {
     "rx90": ("", Slave()),
@@ -86,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(ARMS))
     parser.add_argument("--devices", default=",".join((PHANTOM_NAME, *FIGURES, LEADER_NAME)))
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
     )
@@ -120,9 +121,10 @@ def _slave(arm: str, models: Path | None) -> Slave:
 
 
 def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario]:
-    """The tool moves as in the paper; a small device less, by a larger kinematic scale.
+    """Return scenarios with the motion of the paper; small devices move less, by their scale.
 
-    One hand leads each device less or farther: the leaf lies where the tip then comes down to.
+    The same hand moves devices by different distances: the leaf is where the tip then comes down
+    to.
     """
     scenarios, slave = {}, _slave(arm, models)
     own = 1.0 if arm == "rx90" else 0.5
@@ -157,7 +159,7 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
 
 
 def _lowest(scenario: Scenario) -> np.ndarray:
-    """Where the tip comes down to with nothing there [m, in W]."""
+    """Return the lowest position of the tip without environment [m, in W]."""
     run = run_scenario(replace(scenario, sheet_spring=None), progress=False)
     slave, tips, R_WS, p_WS = NominalSlave(scenario.slave), [], np.empty((3, 3)), np.empty(3)
     for q in run.result["joint_position"]:
@@ -167,7 +169,7 @@ def _lowest(scenario: Scenario) -> np.ndarray:
 
 
 def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
-    """The row of one station; `felt` in free motion only."""
+    """Return the row of one station; `felt` is in free motion only."""
     run = run_scenario(scenario, progress=False)
     summary = summarise(run)
     inertial = summary["peak_measured_force_N"]
@@ -195,9 +197,10 @@ def _hardest(contact_W: np.ndarray) -> float:
 
 
 def _felt_error(scenario: Scenario) -> float:
-    """The larger error [%] of what the hand feels along z: of the device, and of sigma m_t k_f.
+    """Return the larger error [%] of the displayed mass along z: of device, or of sigma m_t k_f.
 
-    Of force and acceleration at one frequency; the load's share by how far the slave follows.
+    It is from force and acceleration at one frequency; the load's share is scaled by the slave's
+    motion.
     """
     found = {sigma: _pushed(scenario, sigma) for sigma in (0.0, _SIGMA)}
     device = scenario.master.device(*_hand(scenario))
@@ -215,7 +218,7 @@ def _hand(scenario: Scenario) -> tuple[float, float]:
 
 
 def _pushed(scenario: Scenario, sigma: float) -> tuple[complex, complex]:
-    """Hand's force over acceleration [kg], and the slave's acceleration over the master's."""
+    """Return the hand's force over acceleration [kg], and the slave's over the master's motion."""
     changed = replace(
         scenario,
         force_scaling__sigma=sigma,

@@ -1,13 +1,13 @@
 """How well does a study use two cores, is it reproducible, and what does a kill cost?
 
 `python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
-(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by
-one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
-processes with SIGKILL at random moments. Baseline of the efficiency is the one process, by the
-clock: it wants an idle machine. Parts are compared byte by byte. `--shards 8` runs only one process
-and, beside it, shards in random order: three are killed at random runs, submitted again and merged.
-The overhead is their CPU time beyond that of one process, with and without the repeated work of the
-kills: one more start each, and the CPU time since the last stored part.
+(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first). It
+uses one process, two processes, and a local Dask cluster, each with an empty folder, and once more
+two processes with SIGKILL at random times. Baseline of the efficiency is the one process, by the
+clock, so the machine must be idle. Parts are compared byte by byte. `--shards 8` runs only one
+process and, next to it, shards in random order: three are killed at random runs, submitted again
+and merged. The overhead is their CPU time beyond that of one process, with and without the repeated
+work of the kills: one more start each, and the CPU time since the last stored part.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ repeats: {repeats}
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=2000, help="a multiple of 400")
+    parser.add_argument("--runs", type=int, default=2000, help="number of runs, a multiple of 400")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument(
-        "--shards", type=int, default=0, help="compare only shards with one process"
+        "--shards", type=int, default=0, help="compare only this number of shards with one process"
     )
-    parser.add_argument("--shards-in", type=Path, help="of `--shards`: its folder")
-    parser.add_argument("--no-cluster", action="store_true", help="without Dask")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--shards-in", type=Path, help="folder of `--shards`")
+    parser.add_argument("--no-cluster", action="store_true", help="skip Dask")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         measure = sharded if arguments.shards else measured
@@ -65,10 +65,10 @@ def main() -> None:
 
 
 def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
-    """All figures; the studies lie in `folder`."""
+    """Return all figures; the studies are in `folder`."""
     study = folder / "study.yaml"
     half = folder / "half.yaml"
-    warm = folder / "warm.yaml"  # compiles what is not compiled yet
+    warm = folder / "warm.yaml"  # fills the cache of compiled code
     repeats = max(arguments.runs // 400, 1)
     study.write_text(_STUDY.format(sigmas=20, gammas=20, repeats=repeats))
     half.write_text(_STUDY.format(sigmas=10, gammas=20, repeats=repeats))
@@ -107,7 +107,7 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def sharded(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
-    """One process, and beside it shards one after another: three are killed and submitted again."""
+    """Run one process, and next to it shards in sequence: three are killed and submitted again."""
     study, warm, found = folder / "study.yaml", folder / "warm.yaml", folder / "shards.json"
     study.write_text(_STUDY.format(sigmas=arguments.runs // 8, gammas=2, repeats=4))
     warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=4))
@@ -144,7 +144,7 @@ def sharded(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def shards(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
-    """All shards of the study in `folder`, then the merge; CPU times without this process."""
+    """Run all shards in `folder`, then the merge; return CPU times without this process."""
     study, out, count = folder / "study.yaml", folder / "out", arguments.shards
     draw, lost, begin = random.Random(53), 0.0, cpu_s()
     chosen = draw.sample(range(1, count + 1), 3)
@@ -153,7 +153,7 @@ def shards(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
         rows = out / f"shards/{number}-of-{count}/runs.parquet"
         process = subprocess.Popen(words)
         if number in chosen and not rows.exists():
-            # A file holds several runs; a shard that is faster than that is not killed.
+            # A file contains several runs; a shard that finishes within one file is not killed.
             stored, last, stop = -1, 0.0, draw.randint(1, max(1, arguments.runs // count // 8))
             while stored < stop and process.poll() is None:
                 if (now := len(list(rows.glob("run_*.parquet")))) != stored:
@@ -174,13 +174,13 @@ def shards(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def cpu_s_of(pid: int) -> float:
-    """CPU time of a running process."""
+    """Return the CPU time of a running process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def cpu_s() -> float:
-    """CPU time of all processes that have ended."""
+    """Return the CPU time of all ended processes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -201,14 +201,14 @@ def command(study: Path, out: Path, *options: str) -> list[str]:
 
 
 def run(study: Path, out: Path, *options: str) -> float:
-    """Seconds by the clock, imports and pictures included."""
+    """Return elapsed seconds, with imports and pictures."""
     start = time.perf_counter()
     subprocess.run(command(study, out, *options), check=True)
     return time.perf_counter() - start
 
 
 def by_turns(*studies: tuple[list[str], float]) -> list[tuple[float, float]]:
-    """Seconds by the clock, and CPU time, of commands that run by turns of so many seconds."""
+    """Return elapsed seconds, and CPU time, of commands that run by turns of some seconds."""
     started = [subprocess.Popen(words, start_new_session=True) for words, _ in studies]
     for process in started:
         os.killpg(process.pid, signal.SIGSTOP)
@@ -231,7 +231,7 @@ def by_turns(*studies: tuple[list[str], float]) -> list[tuple[float, float]]:
 
 
 def killed(study: Path, out: Path, times: int, whole: float) -> int:
-    """Kills the study at random moments; returns how often it was not over before."""
+    """Kill the study at random times; return the number of kills before its end."""
     pauses, kills = random.Random(0), 0
     for _ in range(times):
         process = subprocess.Popen(command(study, out, "--jobs", "2"))

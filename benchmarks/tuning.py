@@ -1,14 +1,15 @@
 """Is a station as stable as `tune` states, and better than the advice of docs/choose.md?
 
 `python benchmarks/tuning.py [--stations 20] [--draws 500] [--station-draws 10] [--json FILE]` draws
-stations from arms, devices, networks and tool masses (seeded; none was used to develop `tune`). For
-each it tunes for light to firm grips at walls of 0.5 to 20 kN/m and draws grips, walls and seeds:
+stations from arms, devices, networks and tool masses (seeded; none was used to develop `tune`). It
+tunes each for light to firm grips at walls of 0.5 to 20 kN/m, and draws grips, walls and seeds:
 
 inside    share of draws in the stated set that rest, rest quietly and render 0.9 of the contact
           force; in one axis, and for `--station-draws` of them in the whole station
 outside   share of the draws in one axis that fail where gamma times stiffness is up to 20 % beyond
           margin and stiffest wall
-advice    the same corners in the whole station with `ledger`, gamma 1, sigma 0, as choose.md says
+advice    the same corners in the whole station with `ledger`, gamma 1, sigma 0, as choose.md
+advises
           for unknown walls and operators: detection threshold and rendered share
 """
 
@@ -44,7 +45,7 @@ HANDS, WALLS, TASK = ("light", "medium", "firm"), (0.5, 20.0), "press"
 
 
 def drawn(rng: np.random.Generator) -> tuple[str, Scenario, str]:
-    """Name, scenario and network of a station."""
+    """Return name, scenario and network of a station."""
     arm, device, network = (str(rng.choice(names)) for names in (ARMS, DEVICES, NETWORKS))
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.2))))
     scenario = replace(
@@ -61,7 +62,7 @@ def drawn(rng: np.random.Generator) -> tuple[str, Scenario, str]:
 
 
 def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, Any]:
-    """Row of one station."""
+    """Return the row of one station."""
     rng = np.random.default_rng([seed, 55])
     name, scenario, network = drawn(rng)
     row: dict[str, Any] = {"station": name}
@@ -122,10 +123,12 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--stations", type=int, default=20)
-    parser.add_argument("--draws", type=int, default=500, help="in one axis")
-    parser.add_argument("--station-draws", type=int, default=10, help="in the whole station")
+    parser.add_argument("--draws", type=int, default=500, help="draws in one axis (default: 500)")
+    parser.add_argument(
+        "--station-draws", type=int, default=10, help="draws in the whole station (default: 10)"
+    )
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     asked = parser.parse_args(arguments)
     rows = []
     for seed in range(asked.stations):

@@ -1,13 +1,14 @@
 """How accurate is each batch estimator for the UTIAS workshop tools?
 
-The protocol of Nadeau, Giamou, Kelly (ICRA 2023): ten tools, simulated stop-and-go motion of 1000
-samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and wrench,
-five seeds. There are no offsets, and all methods know that. The table gives medians over tools and
-seeds of the error of mass [%], centre of mass [mm] and inertia about it [% of the norm], and how
-many results are physically consistent. Ordinary least squares on the same draws is the baseline.
-`consistent` without the motion's noise is the whitened semidefinite program of the literature.
+The protocol is that of Nadeau, Giamou, Kelly (ICRA 2023): ten tools, simulated stop-and-go motion
+of 1000 samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and
+wrench, five seeds. There are no offsets, and all methods assume this. The table gives medians over
+tools and seeds. They are errors of mass [%], centre of mass [mm] and inertia about it [% of the
+norm], and the share of physically consistent results. Ordinary least squares on the same draws is
+the baseline. `consistent` without the motion's noise is the whitened semidefinite program of the
+literature.
 
-The recordings are not shipped; the folder holds one NPZ for each tool. Gravity points up in them.
+The recordings are not shipped; the folder contains one NPZ for each tool, with gravity upwards.
 
     python benchmarks/utias.py [--data FOLDER] [--seeds 5] [--json FILE]
 """
@@ -41,7 +42,7 @@ COLUMNS = ("mass_percent", "com_mm", "inertia_percent", "consistent_percent")
 
 
 def load(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(wrench, s, omega, alpha) without noise and phi of a tool."""
+    """Return (wrench, s, omega, alpha) without noise and phi of a tool."""
     with np.load(file) as data:
         s = data["a_S"] - data["R_WS"].transpose(0, 2, 1) @ np.array([0.0, 0.0, 9.81])
         phi = data["phi_true"]
@@ -50,7 +51,7 @@ def load(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np
 
 
 def errors(found: np.ndarray, phi: np.ndarray) -> tuple[float, float, float]:
-    """Relative error of mass, distance of the centres of mass [m], relative error of inertia."""
+    """Return error of mass (relative), of the centre of mass [m] and of inertia (relative)."""
     (m, c, inertia), (m_0, c_0, inertia_0) = mass_com_inertia(found), mass_com_inertia(phi)
     return (
         abs(m / m_0 - 1.0),
@@ -60,7 +61,7 @@ def errors(found: np.ndarray, phi: np.ndarray) -> tuple[float, float, float]:
 
 
 def run(folder: Path, seeds: int) -> dict[str, dict[str, tuple[float, ...]]]:
-    """level -> method -> (mass %, com mm, inertia %, consistent %), medians."""
+    """Return medians by level and method: (mass %, com mm, inertia %, consistent %)."""
     tools = [load(file) for file in sorted(folder.glob("*.npz"))]
     table: dict[str, dict[str, tuple[float, ...]]] = {}
     for level, (acceleration, angular, force, torque) in LEVELS.items():
@@ -100,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the tools' NPZ files")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     if not any(arguments.data.glob("*.npz")):
         parser.error(f"no tools in {arguments.data}")

@@ -1,7 +1,7 @@
-"""The documentation as a site: `sphinx-build -W docs out/site`, with the extra `docs`.
+"""Configuration of the site: `sphinx-build -W docs out/site`, with the extra `docs`.
 
-Notebooks and the gallery's scripts are run at every build, so that what is shown is what the code
-does; any warning is an error. Nothing is loaded from elsewhere: the site can be read offline.
+Every build executes the notebooks and the gallery's scripts. Any warning is an error. Pages load
+nothing from other servers.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from sphinx.ext import autosummary
 
 _EXT = str(Path(__file__).parent / "_ext")
 sys.path.insert(0, _EXT)
-# Of the processes that run the gallery, too.
+# Also for the processes that run the gallery.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_EXT, os.environ.get("PYTHONPATH"))))
-# They and the notebooks' kernels do not compile the libraries again, whatever the surroundings say.
+# These processes and the notebooks' kernels share the byte code of the libraries.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# One thread of BLAS in each of them: the matrices are small, and the cores have other work.
+# One BLAS thread in each process: the matrices are small, and the other cores are in use.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Pages are trees with links to and fro, among which to look for garbage takes long.
+# Pages are trees with cyclic references; searching them for garbage takes long.
 gc.set_threshold(20_000, 20, 50)
 
 project = "drake_teleop"
@@ -61,19 +61,19 @@ templates_path = ["_templates"]
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
 
-# What is run
+# Execution
 nb_execution_mode = "force"
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
-nb_ipywidgets_js = {}  # they come from elsewhere; of a slider the page shows where it stands
+nb_ipywidgets_js = {}  # loaded from other servers; a slider of the page shows its position
 sphinx_gallery_conf = {
     "examples_dirs": ["gallery"],
     "gallery_dirs": ["examples"],
     "filename_pattern": r"/.*\.py$",
     "abort_on_example_error": True,
-    "parallel": True,  # as many at once as sphinx-build's -j says
+    "parallel": True,  # number of processes from sphinx-build's -j
     "download_all_examples": False,
     "show_memory": False,
     "min_reported_time": 1e9,
@@ -87,7 +87,7 @@ sphinx_gallery_conf = {
 
 # The reference
 viewcode_follow_imported_members = False
-autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", "Figs.")  # end no sentence
+autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", "Figs.")  # do not end a sentence
 autosummary_generate = True
 autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "set"}
 autodoc_typehints = "signature"
@@ -95,15 +95,15 @@ toc_object_entries_show_parents = "hide"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
-# Two classes may have one name; a bare name in an annotation then leads nowhere.
+# Two classes may have one name; a bare name in an annotation then has no link.
 suppress_warnings = ["ref.python"]
 
-# Looks
+# Appearance
 html_theme = "pydata_sphinx_theme"
 html_title = "drake_teleop"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_sidebars = {"start": []}  # a page without others below it
+html_sidebars = {"start": []}  # page without subpages
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
@@ -116,9 +116,9 @@ html_theme_options = {
 
 
 def _as_rst(_app, what, _name, _object, _options, lines: list[str]) -> None:
-    """|x| is an absolute value in docstrings, no substitution, and `Range`s is a word with an s.
+    """Escape |x|, an absolute value in docstrings, and separate the s of `Range`s from its code.
 
-    Why a file is long is for who works on it.
+    Remove the reason for the length of a file.
     """
     if what == "module":
         lines[:1] = [re.sub(r" \(long: [^)]*\)", "", line) for line in lines[:1]]
@@ -130,5 +130,5 @@ def _as_rst(_app, what, _name, _object, _options, lines: list[str]) -> None:
 
 
 def setup(app) -> None:
-    """What no extension does."""
+    """Connect the functions of this file."""
     app.connect("autodoc-process-docstring", _as_rst)

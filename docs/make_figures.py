@@ -1,10 +1,10 @@
-"""Draws the pictures of README and docs into docs/figures.
+"""Draw the pictures of README and docs into docs/figures.
 
-The station, its frames and signs, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample
-log, the frames of a log and the noise of the wrist sensor.
+They are the station, its frames and signs, Fig. 8 as `reproduce` draws it with its 3D scene, the
+sample log, the frames of a log and the noise of the wrist sensor.
 
-Run it as `python docs/make_figures.py`. The scene is a picture of `replay.html` as Chromium shows
-it; without Chromium it stays as it is.
+Usage: `python docs/make_figures.py`. Chromium draws the scene from `replay.html`; without Chromium
+the old picture remains.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FIGURES = Path(__file__).parent / "figures"
 NOISE = runpy.run_path(str(Path(__file__).parent / "_ext" / "sensor_noise.py"))
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
-# Inches: columns from the operator to the slave, rows for motion, force and what serves them.
+# Inches: columns from operator to slave; rows for motion, force and auxiliary blocks.
 COLUMNS = (0.72, 2.2, 3.68, 5.16, 6.64, 8.12, 9.82)
 MOTION, FORCE, BELOW = 3.3, 1.9, 0.55
 WIDTH, HEIGHT = 1.04, 0.68
@@ -56,7 +56,7 @@ MASTER, LINE, SLAVE = "#EEF4FA", "#F3F4F6", "#FBF1EA"
 
 
 def station_figure() -> Picture:
-    """The paper's Fig. 4 with the blocks of this library."""
+    """Draw the paper's Fig. 4 with the blocks of this library."""
     operator, master, scaling, channel, ik, control, slave = COLUMNS
     with plot_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
         figure = Picture(figsize=(10.7, 4.32), facecolor="white", layout="none")
@@ -159,7 +159,7 @@ def _arrow(
     colour: str,
     side: int = 1,
 ) -> None:
-    """An arrow between two blocks' edges, its label above it or to its right (side = 1)."""
+    """Draw an arrow between two blocks' edges, with its label above or right (side = 1)."""
     (x0, y0), (x1, y1) = start, stop
     if y0 == y1:
         shift = (WIDTH / 2) * (1 if x1 > x0 else -1)
@@ -192,7 +192,7 @@ def _line(
 
 
 def frames_figure() -> Picture:
-    """World, sensor and posed frame of a log, and what a description says of them."""
+    """Draw world, sensor frame and posed frame of a log, with the fields that describe them."""
     with plot_style():
         figure = Picture(figsize=(6.4, 3.3), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
@@ -241,7 +241,7 @@ def _pointer(axes: Axes, start: object, end: object, colour: str) -> None:
 
 
 def station_frames_figure() -> Picture:
-    """Where the frames are: W, S, Bcm and contact at the slave, B and E at the master."""
+    """Draw the frames: W, S, Bcm and contact at the slave, B and E at the master."""
     with plot_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
         figure = Picture(figsize=(9.9, 3.3), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
@@ -249,11 +249,11 @@ def station_frames_figure() -> Picture:
         axes.axis("off")
         axes.plot([0.2, 3.0], [0.5, 0.5], color=GREY, linewidth=0.9)
         axes.plot([4.2, 8.4], [0.5, 0.5], color=GREY, linewidth=0.9)
-        # The master: base, two links, stylus.
+        # Master: base, two links, stylus.
         axes.plot([0.8, 0.8, 1.7, 2.3], [0.5, 1.5, 2.3, 1.7], color=GREY, linewidth=6, alpha=0.5)
         _axes_of(axes, (0.8, 0.5), "B", "base of the device; x to the operator", side=-1)
         _axes_of(axes, (2.3, 1.7), "E", "stylus, in the hand", side=1)
-        # The slave: three links, sensor, tool.
+        # Slave: three links, sensor, tool.
         axes.plot([4.9, 4.9, 6.2, 7.2], [0.5, 1.9, 3.0, 2.6], color=GREY, linewidth=8, alpha=0.5)
         _box(axes, (7.0, 2.35), 0.4, 0.2, GREEN)
         _box(axes, (7.08, 1.0), 0.24, 1.35, GREY)
@@ -269,7 +269,7 @@ def station_frames_figure() -> Picture:
 
 
 def signs_figure() -> Picture:
-    """The load alone: at rest, swung upwards, put on a table, and what the sensor exerts then."""
+    """Draw the load at rest, swung upwards and on a table, with the force of the sensor."""
     cases = (
         ("at rest", 1.0, 0.0, "f = −m g"),
         ("swung upwards", 1.5, 0.0, "f = m (a − g)"),
@@ -298,7 +298,7 @@ def signs_figure() -> Picture:
 def _axes_of(
     axes: Axes, origin: tuple[float, float], name: str, words: str, *, side: int, z: int = 1
 ) -> None:
-    """x and z of a frame as arrows, its name at the origin and what it is beside that."""
+    """Draw x and z of a frame as arrows, with its name and further words."""
     x0, z0 = origin
     _line(axes, (x0, z0), (x0 + 0.42, z0), BLUE, "arc3")
     _line(axes, (x0, z0), (x0, z0 + 0.42 * z), BLUE, "arc3")
@@ -318,7 +318,7 @@ def _box(axes: Axes, corner: tuple[float, float], width: float, height: float, c
 
 
 def noise_figure() -> Picture:
-    """Spectrum and Allan deviation of fx at rest: predicted (lines), simulated for 5 min (dots)."""
+    """Draw spectrum and Allan deviation of fx at rest: predicted (lines), simulated (dots)."""
     period, count = 125e-6, 300 * 8000
     lengths = np.unique(np.logspace(0, np.log10(count // 8), 31).astype(int))
     with plot_style():
@@ -354,7 +354,7 @@ def noise_figure() -> Picture:
 
 
 def log_figure(folder: Path) -> Picture:
-    """|F| of the sample log's second record: measured, without the weight, and of the contact."""
+    """Draw |F| of the sample log's second record: measured, without weight, and of the contact."""
     sample_log_command(folder, quiet=True)
     load = identify_log(folder / "free.yaml").identification
     found = detect_log(folder / "touched.yaml", load, free=folder / "free.yaml")
@@ -377,7 +377,7 @@ def log_figure(folder: Path) -> Picture:
 
 
 def film_picture(film: Path, time: float, target: Path) -> None:
-    """A film at one of its times [s]."""
+    """Save the picture of a 3D replay at a time [s]."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         print(f"{target} stays as it is: there is no Chromium")
@@ -392,7 +392,7 @@ def film_picture(film: Path, time: float, target: Path) -> None:
 
 
 def notebook_picture(name: str, cell: int, target: Path) -> None:
-    """The picture that a cell of an executed notebook shows."""
+    """Save the picture of a cell of an executed notebook."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     NotebookClient(notebook, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
     (picture,) = (
@@ -418,7 +418,7 @@ def main() -> None:
         log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")
         reproduce_command(Path(folder))
         shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")
-        # When the tool bends the leaf most.
+        # Time of the largest deflection of the leaf.
         film_picture(Path(folder) / "replay.html", 0.24, FIGURES / "scene.png")
         excite_command("identification", Path(folder) / "excite", quiet=True)
         film_picture(Path(folder) / "excite" / "excitation.html", 1.0, FIGURES / "excitation.png")

@@ -1,10 +1,8 @@
-"""Records docs/figures/drive.webp: a drive in the page of `drake-teleop drive`, in Chromium.
+"""Record docs/figures/drive.webp: a drive in the page of `drake-teleop drive`, in Chromium.
 
-    python docs/make_film.py
-
-A script in the page leads the hand and moves the slider, by the station's own time. Pictures are
-kept as the browser paints them, with the drive in slow motion, and shown at the station's time.
-Prints how slow the drive was, and the film's size and pictures a second.
+Usage: `python docs/make_film.py`. A script in the page moves hand and slider by the station's time.
+The drive runs in slow motion; each picture is shown at its time in the station. Printed are the
+slow-down of the drive, and size and frame rate of the film.
 """
 
 from __future__ import annotations
@@ -27,12 +25,12 @@ from browser import Page, opened  # noqa: E402
 
 FILM = ROOT / "docs" / "figures" / "drive.webp"
 WIDTH, HEIGHT = 1000, 640
-# Without a graphics card the scene is painted a few times a second: the page's own slow motion.
+# Without a graphics card, Chromium draws a few pictures per second: slow motion of the page.
 SLOW = 5
 MOST_PER_S = 10.0
 SECONDS = 12.5
-# Free motion to and fro; down onto the leaf; sigma to 1 and back while it presses; up again. The
-# hand's steps are of 10 um.
+# Free motion back and forth; down onto the leaf; sigma to 1 and back while pressing; up again. The
+# unit is 10 um.
 LEAD = """const smooth = (t, from, to) => {
   const s = Math.min(Math.max((t - from) / (to - from), 0), 1); return s * s * (3 - 2 * s); };
 window.began = frame.t;
@@ -50,14 +48,14 @@ setInterval(() => {
 
 
 class Filmed(Page):
-    """A page that keeps what it shows: (seconds, PNG)."""
+    """Page that stores its pictures: (seconds, PNG)."""
 
     def __init__(self, socket: Any) -> None:
         super().__init__(socket)
         self.pictures: list[tuple[float, bytes]] = []
 
     def heard(self, event: str, params: Any) -> None:
-        """Keeps a picture, and asks for the next."""
+        """Store a picture, and request the next one."""
         super().heard(event, params)
         if event == "Page.screencastFrame":
             self.pictures.append((params["metadata"]["timestamp"], b64decode(params["data"])))
@@ -65,14 +63,14 @@ class Filmed(Page):
 
 
 def filmed(url: str) -> list[tuple[float, bytes]]:
-    """Pictures of a drive, each with the station's time [s]."""
-    clocks = []  # the browser's, and the station's
+    """Return the pictures of a drive, each with the station's time [s]."""
+    clocks = []  # of browser and station
     drawing = ("--use-angle=swiftshader", f"--window-size={WIDTH},{HEIGHT}")
     with opened(url, "", Filmed, drawing) as page:
         size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
         page.call("Emulation.setDeviceMetricsOverride", **size)
         page.until("typeof target !== 'undefined' && target && frame && frame.tool")
-        time.sleep(3.0)  # until all of the scene has come
+        time.sleep(3.0)  # until the scene is complete
         page.run(f"at('slow').value = {SLOW}; at('slow').dispatchEvent(new Event('change')); 1")
         time.sleep(2.0)
         page.run(LEAD)
@@ -87,7 +85,7 @@ def filmed(url: str) -> list[tuple[float, bytes]]:
 
 
 def main() -> None:
-    """Records, writes, and says what it has recorded."""
+    """Record and write the film; print its figures."""
     driven = drive("contact_transition")
     try:
         pictures = filmed(driven.url)

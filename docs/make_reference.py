@@ -1,6 +1,6 @@
-"""Writes what docs/ says about the fields of scenarios and log descriptions, from the code.
+"""Write the parts of docs/ about fields of scenarios and log descriptions, from the code.
 
-Run it as `python docs/make_reference.py`.
+Usage: `python docs/make_reference.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A disk without room: a small tmpfs if this user may mount one, else a limit of the kernel."""
+"""Simulated full disk: a small tmpfs if this user may mount one, otherwise a file size limit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[None]:
-    """Give an empty folder room for `size` bytes; where that cannot be, each new file of it."""
+    """Limit an empty folder to `size` bytes; without tmpfs, limit each new file in it."""
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
     try:
         mounted = subprocess.run(mount, capture_output=True).returncode == 0

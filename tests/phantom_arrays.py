@@ -1,4 +1,4 @@
-"""Kinematics and dynamics of the Phantom as arrays, without hand by default."""
+"""Kinematics and dynamics of the Phantom for arrays, by default without the hand."""
 
 import numpy as np
 

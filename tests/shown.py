@@ -1,8 +1,8 @@
-"""What the pages tell people to type into a shell, and typing it.
+"""Shell blocks of the documentation pages, and their execution by tests.
 
-A block of the language `sh` is typed by a test, which calls `type_in` with its page and how it
-begins; `tests/test_shell_blocks.py` finds the blocks that no test types. What a test cannot do is
-said above the block, in a comment of the page, see `Block`.
+A test runs a block of the language `sh` by `type_in` with its page and its first words.
+`tests/test_shell_blocks.py` finds blocks that no test runs. A comment above such a block states
+the reason, see `Block`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _BLOCK = re.compile(r"((?:^<!-- [^\n]* -->\n)*)^```sh\n(.*?)^```$", re.M | re.S)
 
 
 class Block(NamedTuple):
-    """A block of a page.
+    """Shell block of a page.
 
     Attributes:
-        page, text: where it stands, and what.
-        said: the comments above it: "not run by the tests: " and why, or "run by the tests in
-            small: " and what is less there than for who types it.
+        page, text: page and content of the block.
+        said: the comments above it: "not run by the tests: " and the reason, or "run by the tests
+            in small: " and how the tested block differs.
     """
 
     page: str
@@ -45,18 +45,18 @@ class Block(NamedTuple):
 
     @property
     def left_out(self) -> str:
-        """Why no test types it; "" if one does."""
+        """Reason why no test runs the block; "" if a test does."""
         return "".join(re.findall(r"not run by the tests: (.*) -->", self.said))
 
     @property
     def commands(self) -> list[str]:
-        """One a line; the programs of an environment by their names alone."""
+        """Commands, one per line, with programs of the environment by their names alone."""
         lines = self.text.replace("\\\n", " ").replace(".venv/bin/", "").splitlines()
         return [" ".join(line.split()) for line in lines]
 
 
 def shell_blocks() -> list[Block]:
-    """All that there are."""
+    """Return the shell blocks of all pages."""
     return [
         Block(page, text, said)
         for page in PAGES
@@ -65,14 +65,14 @@ def shell_blocks() -> list[Block]:
 
 
 def the_block(page: str, start: str) -> Block:
-    """The one of the page that begins so and that a test may type."""
+    """Return the only block of the page that begins with `start` and that a test may run."""
     (found,) = (b for b in shell_blocks() if b.page == page and b.text.startswith(start))
     assert not found.left_out
     return found
 
 
 def press_ctrl_c(number: signal.Signals = signal.SIGINT) -> None:
-    """In this process, as a terminal does, or `kill`: for the main thread, which it wakes."""
+    """Send SIGINT to the main thread of this process, as a terminal does."""
     main_thread = threading.main_thread().ident
     assert main_thread is not None
     signal.pthread_kill(main_thread, number)
@@ -80,7 +80,7 @@ def press_ctrl_c(number: signal.Signals = signal.SIGINT) -> None:
 
 @contextlib.contextmanager
 def hearing_ctrl_c() -> Iterator[None]:
-    """A worker of the tests, and what a shell runs in the background, ignore Ctrl-C otherwise."""
+    """Handle Ctrl-C although workers and background processes ignore it by default."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -94,9 +94,9 @@ def hearing_ctrl_c() -> Iterator[None]:
 def type_in(
     page: str, start: str, *, status: int = 0, ctrl_c: threading.Event | None = None
 ) -> None:
-    """Types a block into this folder, line by line; each command ends with that status.
+    """Run the lines of a block in this folder; check the exit status of each command.
 
-    What is no `drake-teleop` is a process of its own, and gets a Ctrl-C at the event.
+    Programs other than `drake-teleop` run in their own processes, which get a Ctrl-C at the event.
     """
     for command in the_block(page, start).commands:
         text, _, file = command.partition(" > ")

@@ -1,4 +1,4 @@
-"""Who listens, by what Linux says of its sockets."""
+"""Listening sockets of processes, from /proc on Linux."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from contextlib import suppress
 from pathlib import Path
 
 THIS_MACHINE = {"0100007F", "00000000000000000000000001000000", "0000000000000000FFFF00000100007F"}
-"""127.0.0.1, ::1, and the first as IPv6 has it."""
+"""127.0.0.1, ::1, and the first in IPv6 notation."""
 
 on_purpose: set[int] = set()
-"""Ports that a test opens to other machines."""
+"""Ports that tests open to other machines deliberately."""
 
 _of_others: set[str] = set()
 
 
 def listening() -> set[str]:
-    """Where this process and those that it has started listen, in Linux' hexadecimal."""
+    """Return the listening addresses of this process and its descendants, in hexadecimal."""
     mine = _inodes()
     return {address for address, _, inode in _listeners() if inode in mine}
 
 
 def ports() -> set[int]:
-    """On which ports they listen."""
+    """Return the ports on which this process and its descendants listen."""
     mine = _inodes()
     return {port for _, port, inode in _listeners() if inode in mine}
 
 
 def open_to_others() -> set[str]:
-    """As `listening`, without what this machine alone reaches; quicker, to be asked often."""
+    """Return the entries of `listening` that other machines can reach; faster than `listening`."""
     there = [
         (address, inode)
         for address, port, inode in _listeners()
@@ -41,7 +41,7 @@ def open_to_others() -> set[str]:
 
 
 def _listeners() -> Iterator[tuple[str, int, str]]:
-    """Address, port and socket of all that listen on this machine."""
+    """Return address, port and socket number of all listening sockets of this machine."""
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
             words = line.split()
@@ -51,9 +51,9 @@ def _listeners() -> Iterator[tuple[str, int, str]]:
 
 
 def _inodes() -> set[str]:
-    """What this process and those that it has started hold open."""
+    """Return the socket numbers that this process and its descendants have open."""
     mine, inodes = {os.getpid()}, set()
-    for _ in range(3):  # the children of children
+    for _ in range(3):  # children of children, too
         for stat in Path("/proc").glob("[0-9]*/stat"):
             with suppress(OSError):
                 if int(stat.read_text().rpartition(")")[2].split()[1]) in mine:

@@ -1,4 +1,4 @@
-"""docs/analysis.md: its scripts run, its tables equal their output or the Diagram's values."""
+"""docs/analysis.md: its scripts run; its tables equal their output or the Diagram's values."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_diagram_works_as_shown():
     shown = 'dt.identify_load(dt.LoadScenario("identification")).estimate'
     assert shown in DIAGRAM
     true = np.concatenate([np.zeros(6), slave_arm(LoadScenario("free_motion_force")).phi_load])
-    true.flags.writeable = False  # as the identified estimate
+    true.flags.writeable = False  # like the identified estimate
     names: dict = {"true": true}
     exec(compile(DIAGRAM.replace(shown, "true"), "analysis.md", "exec"), names)
     assert abs(names["closed"].multipliers[0]) < 1

@@ -1,9 +1,9 @@
-"""The assembled station where nothing is at its default: frames, scales, delays, clutch.
+"""Assembled station without default values: frames, scales, delays, clutch.
 
-The master's base is turned about all three axes, translation, rotation and force are scaled by
-different factors, the two directions of the network differ, and the clutch is opened and closed
-again. What the station records is held against formulas written down here and against Drake's own
-kinematics, so that an exchanged argument or a transposed frame anywhere between the two ends shows.
+The master's base is rotated about all three axes. Translation, rotation and force have different
+scales. The two directions of the network differ, and the clutch opens and closes. The tests compare
+the log with formulas in this file and with Drake's kinematics, so that an exchanged argument or a
+transposed frame is found.
 """
 
 from __future__ import annotations
@@ -51,31 +51,31 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
 
 ALIGNMENT = [0.5, -0.4, 0.8]
-#: R_WB: roll, pitch and yaw about the fixed axes, one after the other.
+#: R_WB as roll, pitch and yaw about the fixed axes.
 R_WB = Rotation.from_euler("xyz", ALIGNMENT).as_matrix()
 MASTER_START, SLAVE_START = [0.25, 0.02, 0.05], [0.52, 0.04, 0.47]
 TRANSLATION, ROTATION, FORCE = 1.5, 0.5, 0.04
 SIGMA, GAMMA = 0.3, 1.3
-#: An estimate that is wrong by a tenth, so that there is a contact wrench, and offsets.
+#: Load estimate with an error of 10 %, so that the contact wrench is not zero, and offsets.
 OFFSETS, ESTIMATED = np.array([0.5, -1.0, 2.0, 0.05, -0.1, 0.08]), 0.9
-PERIOD = 1e-3  # s, of the hand, the channel and the log
-TO_SLAVE, TO_HAND = 3, 7  # steps that a packet travels
-#: When the clutch is opened and closed again [s], in rows of the log too.
+PERIOD = 1e-3  # s, period of hand, channel and log
+TO_SLAVE, TO_HAND = 3, 7  # delay of a packet in steps
+#: Times at which the clutch opens and closes [s]; these are rows of the log too.
 OPENED, CLOSED = 800, 1000
 END = 1500
-#: What is shown at most behind a channel [N, N m]: the peaks of the device.
+#: Limits of the displayed wrench behind a channel [N, N m]: the peaks of the device.
 PEAKS = 37.5, 0.17
-#: Both ends of a channel have left their safe state by now, and its limits of wrench.
+#: Time at which both ends of a channel have left their safe state and its limits of the wrench.
 SETTLED = 850
-#: What is rounding after some thousand steps.
+#: Rounding error after some thousand steps.
 EXACT = 1e-12
 
 
 @dataclass
 class Recorded:
-    """One run: its log, and what Drake says of it.
+    """Log of a run, and Drake's kinematics along it.
 
-    R_WS (N, 3, 3) and p_WS (N, 3) are those of the joint angles in the wrist sensor's sample.
+    R_WS (N, 3, 3) and p_WS (N, 3) belong to the joint angles in the wrist sensor's sample.
     """
 
     scenario: Scenario
@@ -91,7 +91,7 @@ def slave():
 
 
 def turned(**changes: object) -> Scenario:
-    """The hand moves and turns about all axes, from 0.4 s on."""
+    """Move and rotate the hand about all axes from 0.4 s on."""
     sine = Sine(
         t_start=0.4,
         duration=10.0,
@@ -121,9 +121,9 @@ def delayed(method: str, **changes: object) -> Scenario:
         "channel": Channel(
             delay=TO_SLAVE * PERIOD, backward=NetworkConfig(delay=TO_HAND * PERIOD), timeout=0.05
         ),
-        # What arrives is felt, however fast the hand is.
+        # A force is displayed at any speed of the hand.
         "passivity": PassivityConfig(method=method, retreat=[1e3, 1e3]),
-        # Ideal, because the log shows the last sample of each block of noise differently.
+        # Ideal sensor, because the log has other noise in the last sample of each noise block.
         "wrist_sensor__ideal": True,
     } | changes
     return turned(**changes)
@@ -135,7 +135,7 @@ def run(
     offsets: np.ndarray = OFFSETS,
     **known: Any,
 ) -> Recorded:
-    """Runs it with the clutch open from row OPENED to row CLOSED; `known` of MakeTeleopStation."""
+    """Run the scenario with the clutch open in rows OPENED to CLOSED; `known`: load estimate."""
     estimate = np.concatenate([offsets, ESTIMATED * slave.arm.phi_load])
     station = MakeTeleopStation(scenario, **({"load_estimate": estimate} | known))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -151,7 +151,7 @@ def run(
 
 
 def poses_of_S(plant: MultibodyPlant, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R_WS and p_WS at joint angles (N, 6), by Drake's kinematics."""
+    """Return R_WS and p_WS at joint angles (N, 6) by Drake's kinematics."""
     context, sensor = plant.CreateDefaultContext(), plant.GetFrameByName("sensor")
     poses = []
     for q in angles:
@@ -162,22 +162,22 @@ def poses_of_S(plant: MultibodyPlant, angles: np.ndarray) -> tuple[np.ndarray, n
 
 
 def poses_now(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:
-    """R_WS and p_WS where the arm is in each row, younger than in the sample of that row."""
+    """Return R_WS and p_WS at each row's time, which is later than that of its sample."""
     return poses_of_S(recorded.plant, recorded.log["slave_state"][:, :6])
 
 
 def rotations(pose: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of poses (N, 7)."""
+    """Return the rotation matrices (N, 3, 3) of poses (N, 7)."""
     return Rotation.from_quat(pose[..., [1, 2, 3, 0]]).as_matrix()
 
 
 def turn(R: np.ndarray) -> np.ndarray:
-    """Rotation vectors of (N, 3, 3)."""
+    """Return the rotation vectors of (N, 3, 3)."""
     return Rotation.from_matrix(R).as_rotvec()
 
 
 def steps(R: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """(N, 6) what a pose has moved since the row before, [dp; log(R_k R_(k-1)^T)]; first zero."""
+    """Return the motion (N, 6) since the previous row [dp; log(R_k R_(k-1)^T)], first zero."""
     moved = np.zeros((len(p), 6))
     moved[1:, :3] = np.diff(p, axis=0)
     moved[1:, 3:] = turn(R[1:] @ R[:-1].transpose(0, 2, 1))
@@ -185,7 +185,7 @@ def steps(R: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def inertial_wrench(log: SimulationResult, phi: np.ndarray) -> np.ndarray:
-    """(N, 6) Newton and Euler about So, in S, of phi (10,) or, for each row, (N, 10)."""
+    """Return the wrench (N, 6) about So in S by Newton and Euler; phi is (10,) or (N, 10)."""
     s, omega, alpha = (
         log[name] for name in ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
     )
@@ -199,7 +199,7 @@ def inertial_wrench(log: SimulationResult, phi: np.ndarray) -> np.ndarray:
 
 
 def wanted_at_the_hand(recorded: Recorded, slave, offsets: np.ndarray = OFFSETS) -> np.ndarray:
-    """(N, 6) -force_scale R_BW R_WS F', for each row's own sample."""
+    """Return the wrench (N, 6) -force_scale R_BW R_WS F' of each row's sample."""
     non_contact = inertial_wrench(recorded.log, ESTIMATED * slave.arm.phi_load)
     contact = recorded.log["measured_wrench_S"] - offsets - non_contact
     scaled_S = GAMMA * contact + SIGMA * non_contact
@@ -209,7 +209,7 @@ def wanted_at_the_hand(recorded: Recorded, slave, offsets: np.ndarray = OFFSETS)
 
 
 def shortened(wrench: np.ndarray, force: float, torque: float) -> np.ndarray:
-    """Force and torque (N, 3) each, no longer than their limits."""
+    """Return forces and torques (N, 3) that are limited in length."""
     parts = []
     for part, limit in ((wrench[:, :3], force), (wrench[:, 3:], torque)):
         length = np.linalg.norm(part, axis=1, keepdims=True)
@@ -218,12 +218,12 @@ def shortened(wrench: np.ndarray, force: float, torque: float) -> np.ndarray:
 
 
 def in_power_units(wrench_B: np.ndarray) -> np.ndarray:
-    """In W, and such that wrench times motion of the slave's command is work at the hand."""
+    """Return the wrench in W whose work on the slave's command is that at the hand."""
     return np.hstack([wrench_B[:, :3] @ R_WB.T / TRANSLATION, wrench_B[:, 3:] @ R_WB.T / ROTATION])
 
 
 def the_device() -> tuple[MultibodyPlant, Context, Frame, Frame]:
-    """The Phantom as Drake has it from its SDF, with the frames of stylus and base."""
+    """Return Drake's model of the Phantom from its SDF, with the frames of stylus and base."""
     phantom = MultibodyPlant(time_step=0.0)
     Parser(phantom).AddModels(str(models_dir() / "phantom.sdf"))
     phantom.WeldFrames(phantom.world_frame(), phantom.GetFrameByName("base"))
@@ -262,7 +262,7 @@ def assembled_over_a_network(request, over_a_network) -> Recorded:
 
 
 def test_the_command_is_the_scaled_turned_motion_across_the_clutch(assembled):
-    """From the start, then nothing while the clutch is open, then from where it was closed."""
+    """The command follows the hand, rests while the clutch is open, and continues from there."""
     log = assembled.log
     command, master = log["pose_command"], log["pose_master"]
     p, R = command[:, 4:], rotations(command)
@@ -284,7 +284,7 @@ def test_the_command_is_the_scaled_turned_motion_across_the_clutch(assembled):
 
 
 def test_the_slave_goes_where_it_is_told(assembled):
-    """The joint command puts S onto what was received, and the arm is there a little later."""
+    """The joint command puts S at the received pose; the arm reaches it with a lag."""
     log, plant = assembled.log, assembled.plant
     received = log["pose_received" if "pose_received" in log else "pose_command"]
     np.testing.assert_allclose(received[0, 4:], SLAVE_START, atol=EXACT)
@@ -334,7 +334,7 @@ def test_each_direction_has_its_own_random_network_of_the_scenarios_seed(slave):
 
 @pytest.mark.slow
 def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
-    """Whatever the scales of motion are."""
+    """The limit does not depend on the scales of motion."""
     recorded, limit = over_a_network["force_limit"], ForceLimitConfig()
     now = np.arange(SETTLED, END + 1)
     wanted = wanted_at_the_hand(recorded, slave)[now - TO_HAND]
@@ -347,7 +347,7 @@ def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
 
 
 def test_the_drag_that_charges_a_channel_is_the_one_at_the_hand(slave):
-    """All that is felt of a load that is not displayed at all."""
+    """Only the drag is displayed, because the load has a scale of zero."""
     nothing = {"force_scaling__sigma": 0.0, "force_scaling__gamma": 0.0}
     log = run(delayed("charged_tdpa", **nothing), slave).log
     for g, drag in enumerate(PassivityConfig().charged_tdpa.drag):
@@ -357,7 +357,7 @@ def test_the_drag_that_charges_a_channel_is_the_one_at_the_hand(slave):
 
 @pytest.mark.slow
 def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
-    """With a floor so low that the moving load is taken for contacts."""
+    """The noise floor is so low that the moving load counts as contact."""
     rising, still = np.zeros((6, 2)), np.zeros(6)
     floor = NoiseFloor(
         0.05 * np.ones(6), np.identity(16), rising, np.identity(6), still, free_maxima=np.ones(3)
@@ -375,7 +375,7 @@ def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
 
 @pytest.fixture(scope="module")
 def finely_logged(slave) -> Recorded:
-    """Faster logged than anything runs; the load estimator learns, from encoders."""
+    """Return a run that is logged faster than any block runs, with a load estimator."""
     moving = Sine(
         duration=1.0, ramp=0.02, frequency=3.0, translation=[0.01] * 3, rotation=[0.1] * 3
     )
@@ -395,13 +395,13 @@ def finely_logged(slave) -> Recorded:
 
 
 def instants(recorded: Recorded, rate_hz: float) -> np.ndarray:
-    """Rows of the log at which something of this rate happens; the log shows it one row later."""
+    """Return the rows at which something of this rate happens; the log shows it one row later."""
     step = round(recorded.scenario.rates.log_hz / rate_hz)
     return np.arange(0, len(recorded.log.t) - 1, step)
 
 
 def test_every_block_runs_at_its_own_rate(finely_logged):
-    """What changes between rows changes at the block's instants, at nearly each."""
+    """Signals change at nearly all instants of their block, and only there."""
     log, rates = finely_logged.log, finely_logged.scenario.rates
     for signal, rate_hz in {
         "measured_wrench_S": rates.sensor_hz,
@@ -418,7 +418,7 @@ def test_every_block_runs_at_its_own_rate(finely_logged):
 
 
 def test_the_motors_do_what_the_scenarios_controllers_ask_for(finely_logged, slave):
-    """Speed asked for by the position loop, acceleration by the velocity loop, Drake's torque."""
+    """Position loop gives a speed, velocity loop an acceleration, Drake's model the torque."""
     log, plant = finely_logged.log, slave.plant
     context = plant.CreateDefaultContext()
     for row in instants(finely_logged, 2e3)[::10]:
@@ -434,12 +434,12 @@ def test_the_motors_do_what_the_scenarios_controllers_ask_for(finely_logged, sla
 
 
 def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_logged):
-    """As the estimator of logs does from the samples at its own instants."""
+    """The estimator of logs gives the same from the samples at the estimator's instants."""
     log, scenario = finely_logged.log, finely_logged.scenario
     sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
     motion = estimated_motion_std(scenario.motion_estimation, sensor, 6, period)
     estimator = RecursiveTotalLeastSquares(sensor.wrench_std(), motion, forgetting=0.98)
-    # The log shows the last sample of each block of noise differently.
+    # The log has other noise in the last sample of each noise block.
     rows = instants(finely_logged, 500.0)
     rows = rows[log.t[rows] < 0.99 * SAMPLES_PER_NOISE_BLOCK * period]
     names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
@@ -450,12 +450,12 @@ def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_log
 
 
 def test_the_masters_signals_are_what_their_names_say(direct):
-    """The device's by Drake's model of it, the hand's by its impedance, at a firm grip."""
+    """Drake's model gives the device's signals, the impedance of a firm grip those of the hand."""
     log, rows = direct.log, np.arange(SETTLED, END)
     phantom, context, stylus, _ = the_device()
     for row in rows[::50]:
         q, v = np.split(log["master_state"][row], 2)
-        serial = serial_joint_angles(np.array([q, v]))  # the same map turns speeds
+        serial = serial_joint_angles(np.array([q, v]))  # The same map transforms velocities.
         phantom.SetPositions(context, serial[0])
         phantom.SetVelocities(context, serial[1])
         X_BE, V_BE = stylus.CalcPoseInWorld(context), stylus.CalcSpatialVelocityInWorld(context)
@@ -481,13 +481,13 @@ def test_the_masters_signals_are_what_their_names_say(direct):
     twist, hand = log["twist_master"][rows], log["hand_wrench_E"][rows]
     force = 700.0 * apart[rows] + 20.0 * (wanted[0][rows] - twist[:, :3])
     torque = 3.0 * turned_by[rows] + 0.06 * (speed - twist[:, 3:])
-    # What the intent's speed is wrong by, as a difference over 2 ms.
+    # Error of the intended velocity as a difference over 2 ms.
     np.testing.assert_allclose(hand[:, :3], force, atol=1e-3 * np.ptp(force))
     np.testing.assert_allclose(hand[:, 3:], torque, atol=1e-3 * np.ptp(torque))
 
 
 def test_the_slaves_signals_are_what_their_names_say(direct, slave):
-    """Measured, scaled and contact wrench, and the sample's angles."""
+    """Measured, scaled and contact wrench and the sample's angles follow their definitions."""
     log = direct.log
     non_contact = inertial_wrench(log, ESTIMATED * slave.arm.phi_load)
     contact = log["measured_wrench_S"] - OFFSETS - non_contact
@@ -496,7 +496,7 @@ def test_the_slaves_signals_are_what_their_names_say(direct, slave):
     np.testing.assert_allclose(log["scaled_wrench_S"], scaled, atol=1e-11)
     expected = np.tile(np.concatenate([OFFSETS, ESTIMATED * slave.arm.phi_load]), (len(log.t), 1))
     np.testing.assert_array_equal(log["load_estimate"], expected)
-    # The sensor's own offset, and the load's weight and inertia.
+    # Offset of the sensor, and weight and inertia of the load.
     true = inertial_wrench(log, slave.arm.phi_load) + direct.scenario.wrist_sensor.offset
     error = log["measured_wrench_S"] - true
     assert (
@@ -505,9 +505,9 @@ def test_the_slaves_signals_are_what_their_names_say(direct, slave):
 
 
 def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
-    """eta keeps a share of the object; if another load hangs there, the gripper is what is known.
+    """A share eta of the object is displayed; the known load counts as the gripper.
 
-    The load is a tenth heavier than the estimate, which is said to be exact.
+    The true load is 10 % heavier than the estimate, whose covariance is zero.
     """
     gripper, eta = 0.5 * slave.arm.phi_load, 0.3
     scenario = turned(
@@ -528,7 +528,7 @@ def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
 
 @pytest.mark.slow
 def test_a_sample_is_of_the_instant_that_the_log_says(over_a_network, slave):
-    """The ideal sensor's, at 4 kHz, the last one before the row's own instant."""
+    """The sample is the last one of the ideal 4 kHz sensor before the row's time."""
     log = over_a_network["none"].log
     age = log.t - log["sample_time"][:, 0]
     np.testing.assert_allclose(age[1:], 1 / 4000, atol=1e-9)
@@ -538,7 +538,7 @@ def test_a_sample_is_of_the_instant_that_the_log_says(over_a_network, slave):
 
 
 def test_the_device_shows_what_it_can(slave):
-    """37.5 N, and a torque that no motor of the wrist gives more than its peak for."""
+    """The device displays 37.5 N, and a torque within the peaks of the wrist's motors."""
     offsets = np.array([700.0, -500.0, 600.0, 9.0, 15.0, -27.0])
     recorded = run(turned(simulation__duration=0.15), slave, offsets)
     wanted, shown = wanted_at_the_hand(recorded, slave, offsets), recorded.log["force_to_master"]
@@ -559,14 +559,14 @@ def test_the_device_shows_what_it_can(slave):
 
 @pytest.mark.slow
 def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
-    """What is sent by either method's end, in W and in the master's power units."""
+    """Both ends of the method send in W and in the master's power units."""
     recorded, config = over_a_network["four_channel"], PassivityConfig(method="four_channel")
     log, own = recorded.log, config.four_channel
     p, R = log["pose_command"][:, 4:], rotations(log["pose_command"])
     R_now, p_now = poses_now(recorded)
     speed, slaves = steps(R, p) / PERIOD, steps(R_now, p_now) / PERIOD
-    # The slave's servo is told to yield to the hand's force as a spring would. Its stiffness in
-    # the slave's units becomes one in power units by the force's scale over the motion's.
+    # The slave's servo yields to the hand's force like a spring. The ratio of force and motion
+    # scales converts its stiffness to power units.
     hand = in_power_units(log["hand_wrench_E"])
     now = np.arange(SETTLED, END + 1)
     sent = now - TO_SLAVE
@@ -584,7 +584,7 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
         )
         np.testing.assert_allclose(shifted[g], shift, atol=EXACT)
         assert np.abs(hand[sent, group] / K).max() > 1e-4
-    # The hand feels the slave's wrench, and a spring and damper to where the slave was.
+    # The hand gets the slave's wrench, and a spring and damper to the slave's earlier pose.
     heard = now - TO_HAND
     apart = (p_now[heard] - p[now], turn(R_now[heard] @ R[now].transpose(0, 2, 1)))
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))[heard]
@@ -599,11 +599,13 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
 
 @pytest.mark.slow
 def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
-    """What is displayed at row k acts until row k + 1; the log shows that work at row k + 2.
+    """The wrench of row k acts until row k + 1; the log has its work at row k + 2.
 
-    Motion is the command's, turned back into B and divided by the scales. Of translation that is
-    the device's own motion, as long as the clutch is closed. Of rotation it is not quite: a turn
-    by half the angle does not have half the angular velocity while its axis moves.
+    The motion is that of the command, rotated to B and divided by the scales. With the clutch
+    closed,
+    its translation equals the device's motion. Its rotation differs slightly: half the rotation
+    angle
+    does not have half the angular velocity while the axis moves.
     """
     log = assembled_over_a_network.log
     shown = log["force_to_master"]
@@ -624,7 +626,7 @@ def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
 
 @pytest.mark.slow
 def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_network, slave):
-    """In the master's power units, at the arm's own motion, which is not that of the sample."""
+    """The work is in the master's power units, along the arm's motion at the row's time."""
     recorded = assembled_over_a_network
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))
     moved = steps(*poses_now(recorded))
@@ -638,7 +640,7 @@ def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_n
 
 @pytest.mark.slow
 def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
-    """Where nothing is touched, the first two to rounding; this log is too slow for the motors'."""
+    """The first two are zero to rounding without contact; for the motors this log is too slow."""
     recorded = assembled_over_a_network
     log = recorded.log
     accounts = station_accounts(log, recorded.scenario)
@@ -646,7 +648,7 @@ def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
     received = steps(rotations(log["pose_received"]), log["pose_received"][:, 4:])
     for g in (0, 1):
         group = slice(3 * g, 3 * g + 3)
-        # What leaves at row k the log shows at row k + 1.
+        # The log shows at row k + 1 what is sent at row k.
         put_in = np.cumsum(np.sum(wrench[:-1, group] * received[1:, group], axis=1))
         np.testing.assert_allclose(accounts[:-1, COMMAND, g], put_in - put_in[0], atol=EXACT)
         assert np.ptp(put_in) > 1e-4
@@ -657,7 +659,7 @@ def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
 
 
 def test_the_motors_account_is_the_arms_speed(finely_logged, slave):
-    """Without friction, what they do beside bearing the weight is all in the arm's motion."""
+    """The motors' work beyond the weight is the arm's kinetic energy, as there is no friction."""
     log, scenario = finely_logged.log, finely_logged.scenario
     power = GAMMA * FORCE / np.array([TRANSLATION, ROTATION])
     given = -(station_accounts(log, scenario)[:, MOTOR] / power).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The benchmarks' README names scripts that exist; what they compare with is what they measure."""
+"""Benchmarks: the README lists existing scripts, and their baselines are correct."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def describe(x):
 
 @pytest.fixture(scope="module")
 def changed() -> dict[str, set[str]]:
-    """Lines that mutations make of `NUMERIC`, by their kinds."""
+    """Return the lines that mutations make of `NUMERIC`, by kind of mutation."""
     spec = importlib.util.spec_from_file_location("mutations", FOLDER / "mutations.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -141,7 +141,7 @@ def test_a_mutant_is_killed_or_named_and_the_sources_stay_as_they_are(tmp_path: 
         text=True,
     ).stdout
     figures = json.loads((tmp_path / "figures.json").read_text())
-    # Half the constant, and a quotient in place of the product: 0.25; but abs is never needed.
+    # Tests kill half the constant and a quotient for the product; removing abs changes no result.
     assert (figures["load.made"], figures["load.killed"], figures["load.survived"]) == (3, 2, 1)
     assert "load/half.py:3 (removed)\n  - return 0.5 * abs(x)\n  + return 0.5 * (x)\n" in said
     assert {name: (tmp_path / "root" / name).read_text() for name in files} == files
@@ -219,7 +219,7 @@ def test_an_arm_that_is_read_right_differs_in_nothing(arms: ModuleType, tmp_path
         ({"table": (2, 12, 0.1)}, "mass_beyond_kg 0.1"),
         ({"joint_names": ("slide", "turn")}, "rotation_rad"),
         ({"joint_names": ("turn", "other")}, "joints ['turn', 'other'], own SDF:"),
-        ({"table": (0, 9, 0.5)}, ""),  # the base is elsewhere
+        ({"table": (0, 9, 0.5)}, ""),  # other position of the base
     ],
 )
 def test_planted_differences_are_found(
@@ -248,7 +248,7 @@ def test_mujoco_gives_sites_and_torque_limits(arms: ModuleType, tmp_path: Path) 
     assert at_body.joints[0].upper == pytest.approx(np.pi / 3)
     assert [at_site.mass_beyond, at_body.mass_beyond] == [0.0, 0.25]
     assert (at_site.mass_moved, len(at_site.joints)) == (3.25, 1)
-    # At q = ref the body is as drawn; the site is 0.1 m along the body's z, which is -y_W.
+    # At q = ref the body is in its drawn pose; the site is 0.1 m along the body's z, which is -y_W.
     X = at_site.pose(np.array([np.pi / 6]))
     np.testing.assert_allclose(X[:3, 3], [0, -0.1, 0.5], atol=1e-12)
     np.testing.assert_allclose(X[:3, 0], [0, 1, 0], atol=1e-12)

@@ -1,4 +1,4 @@
-"""The commands write the same bytes, whatever surrounds them; benchmarks/bytes.py tries more."""
+"""Commands write the same bytes in any environment; benchmarks/bytes.py tries more of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.station.replay_file import ReplayFile
 
 pytestmark = pytest.mark.checks
 
-# Learns while it moves, so that no identification comes first.
+# The load is estimated during the run, so no identification precedes it.
 SCENARIO = """
 simulation: {duration: 0.05, settle: 0.02}
 operator:
@@ -39,7 +39,7 @@ def benchmark() -> ModuleType:
     return module
 
 
-# Painting takes longest; the benchmark does it.
+# The benchmark renders pictures; this takes longest.
 NO_PICTURES = """
 from matplotlib.figure import Figure
 from drake_teleop.station.replay_file import ReplayFile
@@ -51,7 +51,7 @@ ReplayFile._record_scene = lambda self, make_scene: "<body></body>"
 
 @pytest.mark.slow
 def test_two_surroundings_that_have_nothing_in_common(benchmark, tmp_path, monkeypatch):
-    """This process, and one with more threads, at another place, in another language."""
+    """Compare this process with one of other threads, folder and locale."""
     (tmp_path / "quick.yaml").write_text(SCENARIO)
     (tmp_path / "study.yaml").write_text(STUDY)
     commands = {
@@ -67,7 +67,7 @@ def test_two_surroundings_that_have_nothing_in_common(benchmark, tmp_path, monke
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     for kind, name in ((Figure, "savefig"), (ReplayFile, "_record_scene")):
-        monkeypatch.setattr(kind, name, getattr(kind, name))  # to have it back
+        monkeypatch.setattr(kind, name, getattr(kind, name))  # so that the test can restore it
     monkeypatch.setattr("sys.argv", ["", json.dumps(benchmark.typed(commands))])
     exec(program, {})
     here = benchmark.digests(Path("out"))

@@ -58,7 +58,7 @@ def _answers(monkeypatch) -> dict[str, tuple[float, int]]:
     for name in [name for name in sys.modules if name.split(".")[0] == "edited_package"]:
         del sys.modules[name]
     invalidate_caches()
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it goes by whole seconds
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # file times have whole seconds
     found = {}
     for name in ("outer", "other"):
         function = getattr(import_module(f"edited_package.{name}"), name)
@@ -114,7 +114,7 @@ def test_code_of_old_sources_is_removed(package, monkeypatch, chosen):
     folder = package / "__pycache__"
     if chosen:
         folder = package.parent / "chosen"
-        monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))  # from NUMBA_CACHE_DIR
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))  # or NUMBA_CACHE_DIR
 
     def files():
         return {path.name for path in folder.rglob("outer.outer.*.nbc")}
@@ -224,8 +224,8 @@ def test_package_uses_only_this_njit():
             assert own.search(text), path
 
 
-# Two processes: each reads what is there before the other has written, and `first` begins to
-# write before `second` and ends after it.
+# Two processes: each reads before the other has written, and `first` begins to write before
+# `second` and ends after it.
 SIDE_BY_SIDE = """
 import os, sys, time
 from pathlib import Path
@@ -264,7 +264,7 @@ Path(f"{me} has ended").touch()
 @pytest.mark.long
 @pytest.mark.slow
 def test_two_parallel_first_runs_store_the_right_code(tmp_path):
-    """With numba's own cache, `double(1.5)` is 2 from then on."""
+    """The result of `double(1.5)` stays 2 after such runs with numba's own cache."""
     (tmp_path / "shared.py").write_text(
         HEAD + "\n@njit(cache=True)\ndef double(x):\n    return x + x\n"
     )

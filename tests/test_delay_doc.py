@@ -1,4 +1,4 @@
-"""docs/delay.md and delay-figures.md: scenarios load, tables equal the records and the script."""
+"""docs/delay.md and delay-figures.md: scenarios load; tables equal the records and the script."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def test_its_scenarios_load(tmp_path):
 
 
 def figures(row: str) -> tuple[list[bool], list[float]]:
-    """Whether it is said to be unstable over each network, and what does not depend on luck."""
+    """Return the stability by network, and the figures that do not depend on the last bit."""
     *columns, free_force = row.split("|")[2:-1]
     felt, energy = columns[::2], columns[1::2]
     steady = [float(free_force)]
     for force, joule in zip(felt, energy, strict=True):
         mean, deviation = (float(x) for x in re.findall(r"-?\d+\.\d+", force))
-        # What swings or chatters depends on the last bit.
+        # Amplitudes of oscillation and chatter depend on the last bit.
         if "unstable" not in force and deviation < 0.05:
             steady += [mean, float(joule)]
     return ["unstable" in force for force in felt], steady
@@ -59,7 +59,7 @@ def test_its_table_is_what_its_script_prints(capsys):
 
 
 def table(page: str, head: str) -> dict[str, list[str]]:
-    """First cell -> the others, of the rows under the row that begins so."""
+    """Return first cell -> other cells of the rows below the row that begins with `head`."""
     _, _, below = (ROOT / page).read_text(encoding="utf-8").partition(f"\n{head}")
     rows = below.partition("\n\n")[0].splitlines()[2:]
     cells = ([cell.strip() for cell in row.split("|")[1:-1]] for row in rows)

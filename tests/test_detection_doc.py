@@ -1,4 +1,4 @@
-"""What docs/detection.md tells a user to type works."""
+"""Commands of docs/detection.md run."""
 
 from __future__ import annotations
 

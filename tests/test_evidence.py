@@ -1,4 +1,4 @@
-"""The page of evidence says what its records say, and each claim can be looked up."""
+"""Page of evidence: its figures are those of the records, and each claim has a source."""
 
 from __future__ import annotations
 

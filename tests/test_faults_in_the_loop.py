@@ -1,6 +1,6 @@
-"""Faults in the running station: what the hand feels of them, and that they are named.
+"""Faults in the running station: the force at the hand is limited, and they are reported.
 
-The faults, and what is asked of the force, are those of benchmarks/faults.py.
+The faults and the limits of the force are those of benchmarks/faults.py.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def load_faults() -> ModuleType:
 
 
 faults = load_faults()
-faults.END = 0.95  # s: enough to fade and to begin to come back
+faults.END = 0.95  # s, long enough to fade and to begin to resume
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ NONE, STALE, READING, LOAD, WRENCH, HAND = (
     Fault.NONE, Fault.STALE, Fault.READING, Fault.LOAD, Fault.WRENCH, Fault.HAND,
 )  # fmt: skip
 CASES = [
-    # of the station, kind, place, length, number, size: cause at the slave, at the hand
+    # station, kind, place, length, number, size: reported cause at the slave, at the hand
     ("direct", "nan", "sensor", ONE, 1, np.nan, READING, WRENCH),
     ("direct", "nan", "encoders", SHORT, 3, np.inf, READING, WRENCH),
     ("direct", "nan", "load", LONG, 5, np.nan, LOAD, WRENCH),
@@ -85,7 +85,7 @@ def test_a_fault_is_faded_and_named(name, kind, place, length, index, size, at, 
 
 
 def test_one_sample_of_1e9_newtons_is_not_in_the_filters(direct):
-    """The sensor's own offset makes it, for a hand sample; half a millisecond later all is well."""
+    """The sensor's offset causes it for one hand sample; filters are clean 0.5 ms later."""
     sensor = GetBlock(direct.station, "wrist_sensor")
     (tap,) = direct.taps["sensor"]
     offset, wrenches = np.array(sensor.offset), []
@@ -94,13 +94,13 @@ def test_one_sample_of_1e9_newtons_is_not_in_the_filters(direct):
         def change(x, time, size=size):
             sensor.offset[0] = offset[0] + (size if 0.62 <= time < 0.6205 else 0.0)
 
-        # The place of a fault of no kind: nothing but this.
+        # The fault has no kind: only `change` acts.
         tap.change = change
         result = direct.run(faults.Fault("", "", 0.62, ONE, 0, 0.0))
         tap.change = None
         wrenches.append(result["measured_wrench_S"][(result.t > 0.6215) & (result.t < 0.65), 0])
         assert bool(result["fault"].any()) == (size > 0.0)
-    assert np.abs(wrenches[1] - wrenches[0]).max() < 1.5  # noise of other samples, and no more
+    assert np.abs(wrenches[1] - wrenches[0]).max() < 1.5  # only noise of other samples
 
 
 def test_the_run_ends_with_one_line_if_the_scenario_says_so():

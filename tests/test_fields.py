@@ -1,4 +1,4 @@
-"""List of the fields of scenarios, the source of help texts, references and schemas."""
+"""Fields of scenarios: the source of help texts, references and schemas."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, re
 
 
 def everything(block: type) -> Iterator[tuple[type, FieldInfo]]:
-    """Yield the fields of a block and of all blocks in it."""
+    """Yield the fields of a block and of all its inner blocks."""
     for entry in fields_of(block):
         yield block, entry
         for inner in entry.blocks:
@@ -82,7 +82,7 @@ def test_vector_of_another_length_raises(place: str, surplus: int) -> None:
 
 
 def test_instance_gives_its_own_defaults() -> None:
-    """The same class is at two places with other defaults."""
+    """One class is used at two places with different defaults."""
     charged = named(PassivityConfig, "charged_tdpa").default
     plain = named(PassivityConfig, "tdpa").default
     assert named(plain, "drag").default == [0.0, 0.0] != named(charged, "drag").default

@@ -1,4 +1,4 @@
-"""What the fuzzer has found stays mended, and the fuzzer finds what there is to find."""
+"""Fuzzer: cases that it found stay fixed, and it finds planted faults."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ SAID = {
     "wrenches_ros-damaged_pose.bin": "",
     "wrenches_rtde-no_time_between.bin": "",
 }
-"""Of each case a part of its error; empty if it is none."""
+"""Part of each case's error message; empty if the case is valid."""
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_what_was_found_is_one_line(name: str, fuzz: ModuleType, tmp_path: Path,
     target = fuzz.target_of(CASES / name)
     case = tmp_path / f"case{target.suffix}"
     if target.name == "dmd":
-        target.seeds(tmp_path)  # and what they refer to
+        target.seeds(tmp_path)  # with the files that they refer to
     case.write_bytes((CASES / name).read_bytes())
     line = ""
     with warnings.catch_warnings():
@@ -112,7 +112,7 @@ def test_the_same_numbers_make_the_same_case(fuzz: ModuleType, tmp_path: Path) -
 
 
 def _read(path: Path) -> None:
-    """Does what the first letter of a file says."""
+    """Fail in the way that the first letter of the file selects."""
     word = path.read_bytes()[:1]
     if word == b"e":
         raise KeyError("no such key")

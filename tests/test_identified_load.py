@@ -1,4 +1,4 @@
-"""Cache of identified loads: same bits, never stale, robust to damaged files."""
+"""Cache of identified loads: same bits, never outdated, robust to damaged files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
-# A load near the tool, with numbers without short decimals.
+# Load close to the tool's, with numbers that have no short decimal form.
 RNG = np.random.default_rng(1)
 COVARIANCE = np.diag(RNG.uniform(1e-9, 1e-7, 16))
 COVARIANCE[9, 9] = np.inf

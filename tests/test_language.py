@@ -1,4 +1,4 @@
-"""Docstrings, comments and constants of the package are in plain language."""
+"""Docstrings of the project and constants of the package are in plain language."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ import pytest
 
 pytestmark = pytest.mark.checks
 
-PACKAGE = Path(__file__).parents[1] / "drake_teleop"
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "drake_teleop"
+FOLDERS = ("tests", "benchmarks", "docs", "docs/_ext", "docs/gallery")
+FILES = sorted(
+    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in (ROOT / each).glob("*.py"))]
+)
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
     *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But"),
 }
-"""A docstring begins with a verb or a noun phrase; properties may begin with "Whether"."""
+"""A docstring begins with a verb or a noun phrase; exceptions: "Whether" of
+properties, and questions of benchmarks."""
 GLOSSARY = re.compile(
     r"\b(house|rooms?|attic|felt|feels?|told|tells?|learnt|watched|knocks?|mend(s|ed)?|wanted"
     r"|to and fro|goes over|left behind|hunts|shaken|believe[ds]?|believable|nobody|somebody"
@@ -34,14 +40,15 @@ EXCEPTIONS = {
     "watched": "name of a module or of a state that users read",
     "room": "attribute of a posture: distance to the nearest limit",
     "tell": "in a table of summary names",
+    "knock": "case of a benchmark",
 }
 """Glossary words that may be in docstrings, in at most `MAX_EXCEPTIONS` places, and why."""
 MAX_EXCEPTIONS = 20
 
 
 def docstrings() -> Iterator[tuple[str, str]]:
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE).as_posix()
+    for path in FILES:
+        name = path.relative_to(ROOT).as_posix()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
             if documented and (text := ast.get_docstring(node)):
@@ -52,7 +59,7 @@ def first_words() -> list[str]:
     return [
         f"{where}: {text.splitlines()[0]}"
         for where, text in docstrings()
-        if text.split()[0].strip('`"(,.:') in NOT_FIRST
+        if text.split()[0].strip('`"(,.:') in NOT_FIRST and not text.splitlines()[0].endswith("?")
     ]
 
 
@@ -88,6 +95,30 @@ def vague_constants() -> list[str]:
         names = {token.string for token in tokens if token.type == tokenize.NAME}
         found += [f"{path.name}: {name}" for name in sorted(names) if VAGUE.fullmatch(name)]
     return found
+
+
+def names_in(node: ast.ClassDef) -> set[str]:
+    names = {each.attr for each in ast.walk(node) if isinstance(each, ast.Attribute)}
+    names |= {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+    return names | {each.name for each in ast.walk(node) if isinstance(each, ast.FunctionDef)}
+
+
+def absent_attributes() -> list[str]:
+    """Return attributes that a class lists in its docstring but does not have."""
+    found = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            text = (ast.get_docstring(node) or "") if isinstance(node, ast.ClassDef) else ""
+            section = text.partition("Attributes:\n")[2].partition("\n\n")[0]
+            for line in re.findall(r"^    (\w[\w, ]*):", section, flags=re.M):
+                found += [
+                    f"{node.name}.{name}" for name in set(line.split(", ")) - names_in(node)
+                ]  # fmt: skip
+    return found
+
+
+def test_documented_attributes_exist() -> None:
+    assert absent_attributes() == []
 
 
 def test_docstrings_begin_with_a_verb_or_a_noun() -> None:

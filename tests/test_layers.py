@@ -18,14 +18,14 @@ pytestmark = pytest.mark.checks
 
 PACKAGE = Path(__file__).parents[1] / "drake_teleop"
 LAYERS = ("cli", "live", "lab", "station", "robots", "logs", "load", "common")
-"""From the top downwards; a module imports only its own layer and lower ones."""
+"""Layers from top to bottom; a module imports only from its own layer and from lower ones."""
 WITHOUT_DRAKE = ("common", "load", "logs", "robots", "station.passivity")
 SOLVER = ("load.batch.consistent", "pydrake.solvers")
-"""The one exception: a convex solver, imported when a program is solved."""
+"""The only exception: a convex solver, imported when a program is solved."""
 LARGEST_SHARE = 0.15
 LONGEST_FILE = 450
 REASON = "(long: "
-"""In the first line of a longer file, before why it is one file nevertheless."""
+"""Mark in the first line of a long file, before the reason for its length."""
 
 TOP = {
     *(".ci", ".github", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE"),
@@ -34,7 +34,7 @@ TOP = {
 }
 
 Sources = dict[str, str]
-"""Text of each module, by its name below the package, such as "load.batch.methods"."""
+"""Text of each module by its name below the package, such as "load.batch.methods"."""
 Arrows = dict[str, set[str]]
 
 
@@ -65,7 +65,7 @@ def imports(node: ast.AST) -> list[str]:
 
 
 def between_files(modules: Sources) -> Arrows:
-    """Return for each module the modules of ours that it imports, and "pydrake" if it does."""
+    """Return for each module its imports from the package, and "pydrake" if it imports Drake."""
     arrows: Arrows = {}
     for name, text in modules.items():
         arrows[name] = set()
@@ -74,7 +74,7 @@ def between_files(modules: Sources) -> Arrows:
             if package == "pydrake" and (name, full.rpartition(".")[0]) != SOLVER:
                 arrows[name].add(package)
             if package == "drake_teleop":
-                # Either a module, or a name in one.
+                # The name is a module, or a name in a module.
                 arrows[name] |= {rest, rest.rpartition(".")[0]} & modules.keys()
     return arrows
 
@@ -103,7 +103,7 @@ def between_packages(modules: Sources) -> Arrows:
 
 
 def reached(arrows: Arrows, start: str) -> set[str]:
-    """Return all names that are reached from `start` by one arrow or more."""
+    """Return all modules that are reached from `start` by one import or more."""
     found: set[str] = set()
     ahead = [*arrows[start]]
     while ahead:
@@ -119,7 +119,7 @@ def in_circles(arrows: Arrows) -> list[str]:
 
 
 def packages_with_drake(modules: Sources) -> list[str]:
-    """Return packages that import Drake, directly or not, and must not."""
+    """Return packages that import Drake, directly or indirectly, although they must not."""
     arrows = between_packages(modules)
     plain = [name for name in arrows if name.startswith(WITHOUT_DRAKE)]
     return sorted(name for name in plain if "pydrake" in reached(arrows, name))

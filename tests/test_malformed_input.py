@@ -1,4 +1,4 @@
-"""Bad scenarios and logs: one error line that names file and field, exit status 2."""
+"""Invalid scenarios and logs give one error line with file and field, and exit status 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slave's models: their numbers, and that they parse by themselves and together."""
+"""Models of the slave: their numbers, and that they parse alone and together."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_masses_and_rotors(slave):
     assert masses == [25, 20, 13, 7, 3, 1]
     rx90 = plant.GetModelInstanceByName("rx90")
     assert plant.GetBodyByName("base", rx90).default_mass() == 42
-    assert sum(masses) + 42 == 111  # the manufacturer's figure
+    assert sum(masses) + 42 == 111  # from the manufacturer
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
     assert [a.default_reflected_inertia() for a in actuators] == [3, 3, 1, 0.2, 0.1, 0.05]
 
@@ -102,7 +102,7 @@ def test_every_parameter_of_the_tool_can_be_found(slave):
     phi = arm_of(slave[0]).phi_load
     assert phi[0] == 3.13
     np.testing.assert_allclose(phi[1:4] / phi[0], [0.004, -0.003, 0.085])
-    # None may be so small that an estimate of zero would pass for it.
+    # No value is so small that an estimate of zero would pass.
     assert np.all(np.abs(phi) > 1e-4)
     inertia = np.empty((3, 3))
     inertia[np.triu_indices(3)] = phi[4:]
@@ -141,7 +141,7 @@ def test_the_leaf_moves_up_and_down_and_brings_no_spring_of_its_own(slave):
     bending = plant.GetJointByName("bending")
     assert bending.num_positions() == 1
     np.testing.assert_array_equal(bending.translation_axis(), [0, 0, 1])
-    # Gravity is the only force element: the scenario chooses the spring.
+    # Gravity is the only force element; the scenario chooses the spring.
     assert plant.num_force_elements() == 1
     leaf = 33 / 140 * 7850 * 0.17 * 0.06 * 0.002
     assert plant.GetBodyByName("leaf").default_mass() == pytest.approx(leaf, rel=1e-3)

@@ -1,4 +1,4 @@
-"""`drake-teleop new`: working stations for custom arms."""
+"""Stations for custom arms that `drake-teleop new` writes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ARM = models_dir() / "rx90.sdf"
 
 @pytest.fixture
 def runs(monkeypatch):
-    """Record run commands instead of running them."""
+    """Record run commands instead of executing them."""
     calls = []
 
     def run(scenario, out, **options):
@@ -61,7 +61,7 @@ def test_station_is_written_and_run(tmp_path, runs, capsys):
     assert 0.055 * scale <= plan.place.cube_half_m
     way = 1.5 * plan.swing_amplitude_m + 0.01
     assert way / scale <= 0.113 / 2
-    # From the tool's lowest point onto the wall, at most 1 cm deep.
+    # The distance from the tool's lowest point to the wall, which the tool enters by at most 1 cm.
     tip = NominalSlave(scenario.slave).start_tip
     wall = scenario.environment[0].position[2]
     assert wall == pytest.approx(tip[2] - 1.5 * plan.swing_amplitude_m, abs=1e-3)
@@ -94,9 +94,9 @@ def test_place_is_in_front_with_a_reachable_cube():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("device", ["phantom_premium_15", "falcon"])  # fast and slow
+@pytest.mark.parametrize("device", ["phantom_premium_15", "falcon"])  # high and low rates
 def test_rates_match_the_device(tmp_path, runs, device):
-    """`analyze` requires common sampling instants."""
+    """`analyze` requires that sampling instants coincide."""
     new_command(tmp_path / "mine", ARM, "sensor", device=device)
     scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
     assert scenario.master.sampling_period(scenario.rates.hand_hz) is None
@@ -141,7 +141,7 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
     along = np.eye(3)["xyz".index(axis)]
     np.testing.assert_allclose(R_WS @ along, [0.0, 0.0, -1.0], atol=1e-3)
     np.testing.assert_allclose(slave.tip, 0.112 * along, atol=1e-9)
-    # The advised frame gives a station with z_S down.
+    # The recommended frame gives a station with z_S down.
     text = path.read_text()
     frame = f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>'
     path.write_text(text.replace("</model>", f"{frame}</model>", 1))
@@ -150,7 +150,7 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
 
 
 def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
-    """Its last joint cannot turn x_S forward."""
+    """The last joint of this arm cannot turn x_S forward."""
     text = ARM.read_text()
     joint = text.index('name="joint_6"')
     lower, upper = (text.index(f"<{tag}>", joint) for tag in ("lower", "upper"))
@@ -203,7 +203,7 @@ def odd_names(count: int) -> list[str]:
 
 @pytest.mark.long
 def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
-    """Names of the arm's file and folder, packages, tool, sensor frame."""
+    """Try names of the arm's file and folder, packages, tool and sensor frame."""
     plan = plan_station(ARM, "sensor")
     monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
     monkeypatch.setattr(new_station, "write_picture", lambda *_: None)
@@ -235,7 +235,7 @@ def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
     (tmp_path / "arm.sdf").write_text(
         text.replace("<mass>", "<mass>1")
-    )  # a different arm beside it
+    )  # different arm in the same folder
     new_command(tmp_path / "mine", path, "1e-3", quiet=True)
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     assert (slave.path, slave.sensor_frame) == (path, "1e-3")

@@ -1,4 +1,4 @@
-"""The notebooks as they are committed. Building the site runs them, and checks their promises."""
+"""Notebooks as committed; the build of the site executes them and checks their statements."""
 
 from __future__ import annotations
 

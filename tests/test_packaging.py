@@ -1,4 +1,4 @@
-"""The wheel carries everything, and works in an environment and a folder of its own."""
+"""The wheel contains all files and works in its own environment and folder."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def built(target: str, source: Path, folder: Path) -> Path:
 
 
 def run(*command: str, cwd: Path) -> str:
-    # Only what is installed may be found, not what a shell or a test run points to.
+    # Only installed packages may be found, not those of the shell's or the tests' environment.
     foreign = {"PYTHONPATH", "NUMBA_CACHE_DIR"}
     environment = {name: value for name, value in os.environ.items() if name not in foreign}
     answer = subprocess.run(
@@ -78,7 +78,7 @@ def test_the_wheel_holds_what_the_repository_holds_and_nothing_else(wheel):
 @pytest.mark.slow
 def test_the_source_distribution_builds_the_same_wheel(wheel, tmp_path):
     source = built("sdist", ROOT, tmp_path / "sdist")
-    # Without a filter, which Python 3.11.2 does not know: we made it ourselves.
+    # Without `filter`, which Python 3.11.2 lacks; this test made the archive.
     shutil.unpack_archive(source, tmp_path / "source")
     (unpacked,) = (tmp_path / "source").iterdir()
     again = zipfile.ZipFile(built("wheel", unpacked, tmp_path / "wheel"))
@@ -109,12 +109,13 @@ def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
     empty.mkdir()
     pip = (sys.executable, "-m", "pip", "--python", python)
     run(*pip, "install", "--no-deps", "--no-index", "--no-compile", str(wheel), cwd=empty)
-    # What was compiled from the same code need not be compiled again, wherever it lies.
+    # Code that was compiled from the same sources is reused from any folder.
     for compiled in (ROOT / "drake_teleop").rglob("*.nbc"):
         copy = library / compiled.relative_to(ROOT)
         copy.parent.mkdir(exist_ok=True)
         shutil.copy(compiled, copy)
-    # The dependencies are those of this run; its own drake_teleop comes later in the path, or not.
+    # The dependencies are those of this run. Its own drake_teleop comes later in the path, or is
+    # absent.
     (library / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     listing = run(python, "-c", USE, cwd=empty).splitlines()
     assert "teleop_station free_motion_force" in listing
@@ -130,7 +131,7 @@ def test_the_version_that_is_released_is_the_one_that_is_cited():
 
 
 def test_what_is_advised_installs_an_extra_that_there_is():
-    """No index has this project: an extra is installed in the clone."""
+    """The recommended command installs an extra from the clone; no index has the project."""
     extras = set(metadata("drake_teleop").get_all("Provides-Extra"))
     texts = {
         path: path.read_text(encoding="utf-8")

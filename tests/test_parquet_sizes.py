@@ -1,4 +1,4 @@
-"""Parquet files that would abort polars are refused, and no good one is."""
+"""Parquet files that would abort polars are refused; all good files are accepted."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_good_files_of_arrow_pass(tmp_path, version, dictionary):
     options = {"data_page_version": version, "use_dictionary": dictionary, "data_page_size": 500}
     parquet.write_table(MIXED.to_arrow(), path, write_page_index=True, **options)
     check_parquet(path)
-    parquet.ParquetWriter(path, MIXED.to_arrow().schema).close()  # without a row group
+    parquet.ParquetWriter(path, MIXED.to_arrow().schema).close()  # file without a row group
     check_parquet(path)
 
 
@@ -133,7 +133,7 @@ for place in range(len(good)):
     ],
 )
 def test_no_damaged_byte_ends_the_process(tmp_path: Path, bits: int, options: dict) -> None:
-    """The lowest bit of a number is its sign."""
+    """Change single bytes; the lowest bit of a number is its sign."""
     path = tmp_path / "x.parquet"
     MIXED.select("t", "few", "empty").head(20).write_parquet(path, **options)
     command = [sys.executable, "-c", _READ_EACH, str(path), str(bits)]

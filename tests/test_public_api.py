@@ -1,4 +1,4 @@
-"""`drake_teleop` itself: light to import, complete, and honest about what it holds."""
+"""Public names of `drake_teleop`: fast import, complete list, docstrings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_type_checkers_see_the_names_where_they_are_at_run_time():
     [
         ("import drake_teleop", {"numpy", "numba", "polars", "matplotlib", "pydrake"}),
         ("from drake_teleop import identify, scaled_wrench, read_log", {"pydrake"}),
-        # What a process of a study begins with; its work may need less than a station.
+        # Imports at the start of a study's process, which may need less than a station.
         ("import drake_teleop.lab.studies.runs", {"numba", "matplotlib", "pydrake"}),
     ],
 )

@@ -1,4 +1,4 @@
-"""The code keeps the house's style and its types hold."""
+"""Code style by ruff and types by mypy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# The type stubs of numpy differ from one Python to the next, and with them what mypy finds.
+# numpy's type stubs differ between Python versions, and so do the results of mypy.
 pytestmark = [
     pytest.mark.checks,
     pytest.mark.skipif(
@@ -20,8 +20,7 @@ pytestmark = [
 ]
 
 
-#: mypy as it is, but for its search for garbage, a quarter of its time, which it turns on itself,
-#: and for the cache that it would write.
+#: mypy without its cache and with fewer garbage collections, which take a quarter of its time.
 MYPY = "import gc; gc.disable(); gc.enable = gc.disable; from mypy.main import main; main()"
 
 

@@ -1,4 +1,4 @@
-"""The commands and the example of the README work as they are written."""
+"""Commands and the example of the README run as written."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_every_link_into_the_repository_leads_somewhere():
 
 
 def test_ci_runs_the_readmes_test_commands(tmp_path):
-    # A copy of the two files in a folder where the command's programs only say their names.
+    # Copy of the two files in a folder in which all programs only print their names.
     (tmp_path / ".ci").mkdir()
     (tmp_path / ".ci" / "run").write_text((ROOT / ".ci" / "run").read_text())
     (tmp_path / "README.md").write_text(README)
@@ -73,9 +73,9 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
         check=True,
     )
     (command,) = re.findall("<!-- the test command -->\n```sh\n(.*?)\n```", README, re.S)
-    assert answer.stderr.startswith(command + "\n")  # bash prints the commands that it runs
+    assert answer.stderr.startswith(command + "\n")  # bash prints the commands that it executes
     lines = answer.stdout.splitlines()
-    assert [*lines[:-2], *sorted(lines[-2:])] == [  # fuzzer and site run side by side
+    assert [*lines[:-2], *sorted(lines[-2:])] == [  # fuzzer and site run in parallel
         "python3 -m venv --upgrade-deps .venv-test",
         "pip install -q --no-compile -e .[test,docs]",
         "pytest -n 2 --dist worksteal",

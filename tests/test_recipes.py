@@ -1,4 +1,4 @@
-"""The recipes of docs/extend.md."""
+"""Recipes of docs/extend.md."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def block(first_line: str) -> str:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Folder with the files of the page; parts that a test registers are removed again."""
+    """Return a folder with the files of the page; remove the registered parts afterwards."""
     for name in ("parts.py", "share.yaml"):
         (tmp_path / name).write_text(block(name))
     monkeypatch.chdir(tmp_path)
@@ -109,7 +109,7 @@ def test_a_scenario_with_a_removed_method_names_it(folder):
 
 @pytest.mark.slow
 def test_the_registered_share_scales_the_wrench(folder):
-    """All of the wrench is what there is without a method, none of it is none."""
+    """A share of 1 renders the wrench of no method, a share of 0 renders none."""
     register_from_script(folder / "parts.py")
 
     def force(**passivity):
@@ -122,7 +122,7 @@ def test_the_registered_share_scales_the_wrench(folder):
         return simulate(MakeTeleopStation(scenario), scenario.simulation)["force_to_master"]
 
     nothing = force(method="none")
-    assert np.abs(nothing).max() > 1.0  # the tool's weight
+    assert np.abs(nothing).max() > 1.0  # weight of the tool
     np.testing.assert_array_equal(force(method="share", registered={"share": 1.0}), nothing)
     assert (force(method="share", registered={"share": 0.0}) == 0.0).all()
 
@@ -222,7 +222,7 @@ def test_another_process_registers_the_same_parts_when_a_name_is_unknown(folder)
 
 
 def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
-    """With them `run` has all it wants."""
+    """`run` needs no other file."""
     (text,) = re.findall(r"^```yaml\n(slave:.*?)^```$", RECIPES, re.M | re.S)
     assert len(text.splitlines()) <= 10
     shutil.copy(ROOT / "models" / "leader_arm.urdf", tmp_path / "arm.urdf")

@@ -54,7 +54,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
 
 
 def of_player(page: str) -> dict:
-    """Return the data of the page's player."""
+    """Return the data in the page's player."""
     return json.loads(re.search(r"const film = (.*);\n", page)[1])
 
 
@@ -67,7 +67,7 @@ def test_postures_equal_the_record(meshcat, scenario, result):
         pose = result["pose_master"][sample]
         np.testing.assert_allclose(X_BE.translation(), pose[4:], atol=1e-12)
         tool = scene.plant.GetFrameByName("sensor").CalcPoseInWorld(scene.context)
-        # The arm follows the command with a lag of some centimetres.
+        # The arm lags the command by some centimetres.
         np.testing.assert_allclose(
             tool.translation(), result["pose_command"][sample, 4:], atol=0.06
         )
@@ -76,12 +76,12 @@ def test_postures_equal_the_record(meshcat, scenario, result):
 def test_arrows_of_load_point_down_and_of_contact_up(meshcat, scenario, result, arrows):
     recorded = {name: np.array(result[name]) for name in result}
     recorded["load_estimate"][:] = 0.0
-    weight = R_WS_HOME.inverse().matrix() @ [0.0, 0.0, 30.7]  # the sensor holds the load up
+    weight = R_WS_HOME.inverse().matrix() @ [0.0, 0.0, 30.7]  # the sensor carries the load
     recorded["measured_wrench_S"][:, :3] = weight
     recorded["contact_wrench_S"][:, :3] = -0.5 * weight
     scene = ReplayScene(meshcat, scenario, result)
     scene.show_sample(0.0, SimulationResult(result.t, recorded, result.specs), 0)
-    # The tool swings by less than a degree.
+    # The tool rotates by less than a degree.
     np.testing.assert_allclose(arrows["measured_at_stylus"], [0, 0, -30.7], atol=0.5)
     np.testing.assert_allclose(arrows["contact_at_stylus"], [0, 0, 15.35], atol=0.25)
     np.testing.assert_allclose(arrows["measured_at_wrist"], arrows["measured_at_stylus"])
@@ -89,7 +89,7 @@ def test_arrows_of_load_point_down_and_of_contact_up(meshcat, scenario, result, 
 
 
 def test_replay_without_master_shows_slave_and_measured_force(meshcat, scenario, result, arrows):
-    """As in a run that identifies the load."""
+    """A run that identifies the load has no master."""
     names = ("slave_state", "measured_wrench_S", "load_estimate", "sheet_state")
     recorded = {name: result[name] for name in names}
     scene = ReplayScene(meshcat, scenario, recorded)
@@ -111,9 +111,9 @@ def page(tmp_path_factory, scenario, result) -> str:
 
 
 def test_replay_is_one_self_contained_page(page):
-    assert 1e6 < len(page) < 4e6  # Meshcat itself is inside
+    assert 1e6 < len(page) < 4e6  # Meshcat is inside the page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=.?(http|//|/)", page)
-    # What the player asks Meshcat for.
+    # Names that the player uses of Meshcat.
     assert all(
         name in page
         for name in (
@@ -135,7 +135,7 @@ def test_clock_and_readings_equal_the_log(page, scenario, result):
     assert shown["clock"] == "simulated time"
     measured, contact, hand = shown["readings"]
     assert measured["arrow"] and contact["arrow"] and not hand["arrow"]
-    # 40 ms a hundred times slower: a frame every 0.2 ms, of a log of 1 kHz.
+    # 40 ms, a hundred times slower: a frame every 0.2 ms, from a log of 1 kHz.
     assert (shown["slow_motion"], shown["frames"]) == (100, 201)
     for reading, force in (
         (measured, result["measured_wrench_S"] - result["load_estimate"][:, :6]),
@@ -148,7 +148,7 @@ def test_clock_and_readings_equal_the_log(page, scenario, result):
 
 
 def test_replay_restarts_at_its_end(page):
-    """The player's next frame equals a Python implementation."""
+    """The player's next frame equals that of a Python implementation."""
     (following,) = re.findall(r"if \(playing\) show\((.*)\);", page)
     film = SimpleNamespace(span=0.04)
     for now, expected in ((0.01, 0.012), (0.039, 0.001)):
@@ -191,7 +191,7 @@ def test_folder_without_run_is_rejected(tmp_path, scenario, result):
 def test_replay_has_fifty_frames_per_second(
     tmp_path, monkeypatch, scenario, result, slow_motion, frames
 ):
-    """Meshcat stores a frame per whole interval; none may be lost."""
+    """Meshcat stores one frame for each whole interval."""
     kept = {}
 
     class Recorder:
@@ -220,7 +220,7 @@ def test_replay_has_fifty_frames_per_second(
 
 
 def test_meshcat_server_is_stopped_after_writing(tmp_path, result, scenario, monkeypatch):
-    """Later collection in a thread of a progress bar would abort the program."""
+    """A later garbage collection in a progress bar's thread would abort the program."""
     ports = []
 
     def remember(params):

@@ -38,7 +38,7 @@ def test_page_escapes_all_texts_and_numbers(tmp_path):
     assert player.count("</script>") == 1
     assert "<h1>&lt;/script&gt;&lt;b&gt;&amp;</h1>" in player
     assert "<i>" not in player
-    assert 'name="viewport" content="width=device-width' in page  # or it is 980 pixels wide
+    assert 'name="viewport" content="width=device-width' in page  # otherwise it is 980 pixels wide
     found = json.loads(re.search(r"const film = (.*);\n", player)[1])
     assert found["title"] == "</script><b>&"
     assert found["readings"][0]["values"] == [None, 1.235, 20.0]

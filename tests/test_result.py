@@ -144,7 +144,7 @@ def test_parquet_round_trip_keeps_values_units_and_descriptions(tmp_path):
 
 
 def test_same_data_same_bytes_other_data_other_bytes(tmp_path):
-    # More samples than one row group holds, so that its size matters.
+    # More samples than a row group contains, so that its size matters.
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         make_result(70_000, seed).write_parquet(tmp_path / name)
     a, b, c = ((tmp_path / name).read_bytes() for name in "abc")

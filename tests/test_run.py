@@ -35,7 +35,7 @@ operator:
 
 @pytest.fixture(scope="module")
 def typed(tmp_path_factory):
-    """Run the commands of README and beginners' page; return their output folder."""
+    """Run the commands of README and the beginners' page; return their output folder."""
     folder = tmp_path_factory.mktemp("typed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -115,14 +115,14 @@ def test_written_scenario_is_the_one_that_was_run(typed):
 
 @pytest.mark.slow
 def test_peg_task_succeeds(typed):
-    """The shipped scenario; other outcomes: `tests/operator/test_task.py`."""
+    """Run the shipped scenario; `tests/operator/test_task.py` tests other outcomes."""
     summary = summary_of(typed / "insert")
     assert summary["success"] == 1 and summary["false_notices"] == 0
 
 
 @pytest.mark.slow
 def test_shipped_identification_matches_the_log_tools(identification):
-    """Its sensor log gives the same load with the log tools."""
+    """The log tools find the same load in the run's sensor log."""
     summary, out = identification
     assert summary["duration_s"] == 6.0
     assert (out / "replay.html").exists()

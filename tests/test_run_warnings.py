@@ -1,4 +1,4 @@
-"""Warnings of a run: only planted conditions are reported, with times."""
+"""Warnings of a run: only planted conditions are reported, with their times."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OVER_NETWORK = replace(
     channel=Channel(network="internet", timeout=0.1),
     passivity=PassivityConfig(method="two_layer"),
 )
-LATE = 0.05  # s, of the recorded channel, a mean of "internet"
+LATE = 0.05  # s, mean delay of the recorded channel, that of "internet"
 
 
 def smooth(t):
@@ -97,7 +97,7 @@ PLANTED = [
     ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, no packets arrive"
      " from the slave, from 1.000 to 2.000 s"),
     ("ports", (5, np.where(during(1, 2), np.inf, 0)), "slave's end is in its safe state"),
-    # It stays 4 cm behind: more than is explained from 0.5 s + half of the movement + delay on.
+    # The error of 4 cm is unexplained from 0.5 s + half of the movement + delay on.
     ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) delays"
      " the slave's command: up to 40.0 mm more than its delay explains, from 0.9"),
     ("pose_received", (3, 0.1 * during(2, 2.5)), "11.5 degrees more"),
@@ -126,7 +126,7 @@ def test_only_the_planted_condition_is_reported(name, change, said):
         ("ports", (5, 0.15 * during(1.0, 1.15))),
         ("pose_received", (6, 0.04 * during(1.6, 1.75))),
         ("slave_state", (5, 0.01 * during(1.0, 1.15))),
-        # An answer that rings twice, and a tremble that nobody sees.
+        # A response that rings twice, and an invisible tremor.
         ("pose_master", (5, 0.003 * np.exp(-8 * (T - 1)) * np.sin(25 * (T - 1)) * (T > 1))),
         ("slave_state", (3, 0.0008 * np.sin(40 * T) * during(1, 2))),
         ("force_to_master", (0, 0.06 * np.sin(2 * np.pi * 44 * T))),
@@ -143,7 +143,7 @@ def test_normal_run_has_no_warnings():
 
 
 def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
-    """A wall whose face is 20 mm above the end of the tool, or below it."""
+    """The face of the wall is 20 mm above or below the end of the tool."""
     tip = NominalSlave(Scenario().slave).start_tip
     for depth, count in ((0.02, 1), (-0.02, 0)):
         wall = Wall(position=[*tip[:2], tip[2] + depth], size=[0.05, 0.05])
@@ -155,7 +155,7 @@ def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
 
 
 def test_ledger_reserve_warning_gives_the_required_energy():
-    """The hand moves at up to 0.164 m/s; 0.02 J allow 0.091 m/s of the slave."""
+    """The hand moves at up to 0.164 m/s; 0.02 J allow the slave 0.091 m/s."""
     scenario = replace(
         Scenario(),
         channel=Channel(delay=LATE),
@@ -168,10 +168,11 @@ def test_ledger_reserve_warning_gives_the_required_energy():
     (warning,) = found
     assert warning.startswith("the ledger's reserve limits the slave to 0.091 m/s, and the hand")
     assert "moves at up to 0.16: " in warning
-    # What it was told within the last 50 ms is no further away than this.
+    # Distance to the nearest command of the last 50 ms.
     far = float(warning.split("command is up to ")[1].split(" mm")[0])
     assert 0.0 < 1e3 * np.abs(held).max() - far < 50 * 0.164
-    # (0.164 / 0.0905)^2 of it; the hand's reserve of 0.02 J comes to what is there at the start.
+    # The required energy is (0.164 / 0.0905)^2 times the reserve; the hand's reserve of 0.02 J is
+    # added to the start energy.
     assert "passivity.ledger.reserve [0.066, 0.01] and initial [0.086, 0.011]" in warning
     quiet = replace(scenario, passivity__ledger=LedgerConfig())
     assert not any("reserve" in x for x in run_warnings(recorded(**slower), quiet, ARM))
@@ -181,7 +182,7 @@ def test_wrist_motor_limit_uses_the_device_axes():
     q, J = np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]), np.empty((6, 6))
     jacobian_into.py_func(q, J)
     posture = (slice(0, 6), q - HOME_POSTURE_RAD)
-    about = J[3:, 5]  # the last axis, that of the weakest motor
+    about = J[3:, 5]  # the last axis, with the weakest motor
     for share, warnings in ((1.0, 1), (0.99, 0)):
         torque = share * PEAK_WRIST_TORQUES_N_M[2] * during(1, 2)[:, np.newaxis] * about
         full = (slice(3, 6), torque)
@@ -284,7 +285,7 @@ def test_chatter_is_reported_with_rate_force_and_time(rate_hz, rest):
         touching(4.0, 0.5, 2.9),
         touching(20.0, 0.5, 0.84),  # 7 touches
         touching(40.0, 0.5, 0.78),  # too short
-        touching(47.0, 0.5, 2.5, rest=4.0),  # contact is kept: friction
+        touching(47.0, 0.5, 2.5, rest=4.0),  # contact persists by friction
         touching(40.0, 0.5, 2.5, peak=0.3),
         touching(300.0, 0.5, 2.5),  # one touch-down with small bounces
         sum(touching(60.0, start, start + 0.05) for start in (0.5, 1.0, 1.5)),
@@ -340,10 +341,10 @@ def test_chatter_on_a_spring_loaded_drawer_is_reported(tmp_path, damping, chatte
 
 @pytest.mark.slow
 def test_slave_follows_with_a_late_wrist_sensor():
-    """The accelerations, and so the sample, are 6 ms late.
+    """The sample, with its accelerations, is 6 ms late.
 
-    Energy must not be calculated with joint angles of that instant: it would empty the slave's
-    tank, and the slave would lag by 4 cm without a warning.
+    Energy must not be calculated with joint angles of that time: it would empty the slave's tank,
+    and the slave would lag by 4 cm without a warning.
     """
     move = MinimumJerk(t_start=0.5, duration=0.8, translation=[0.0, 0.0, -0.07])
     scenario = replace(
@@ -351,10 +352,10 @@ def test_slave_follows_with_a_late_wrist_sensor():
         simulation=Simulation(duration=1.1, settle=0.0),
         operator=OperatorConfig(intent=[move]),
         wrist_sensor=PRESETS["ati_gamma_imu"],
-        force_scaling__sigma=1.0,  # so that it need not know its load
+        force_scaling__sigma=1.0,  # so that no load is needed
     )
     result = simulate(MakeTeleopStation(scenario), scenario.simulation)
     assert run_warnings(result, scenario, slave_arm(scenario)) == []
     sent, received = result["pose_command"][:, 6], result["pose_received"][:, 6]
-    assert sent[-1] < 0.42  # it moves
+    assert sent[-1] < 0.42  # the slave moves
     assert abs(received[-1] - np.interp(result.t[-1] - LATE, result.t, sent)) < 2e-3

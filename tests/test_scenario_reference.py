@@ -55,7 +55,7 @@ def test_docs_equal_the_generated_reference() -> None:
 def test_every_link_in_the_reference_leads_to_a_block() -> None:
     links = {part.partition(")")[0] for part in reference_page().split("](#")[1:]}
     titles = [line[3:] for line in reference_page().splitlines() if line.startswith("## ")]
-    # As GitHub makes them: small letters, no points, colons and exclamation marks.
+    # GitHub's anchors: lower case, without points, colons and exclamation marks.
     anchors = [title.lower().translate({ord(" "): "-", **dict.fromkeys(map(ord, ".:!"))})
                for title in titles]  # fmt: skip
     assert len(anchors) == len(links)

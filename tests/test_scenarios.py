@@ -1,4 +1,4 @@
-"""The shipped scenarios load, and their motions are feasible."""
+"""Shipped scenarios load, and their motions are feasible."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drake_teleop.station.station import MakeTeleopStation
 
 MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition", "peg_in_slot")
 TASKS = ("insert", "press", "reach", "touch")
-#: A task takes seconds; how fast and how far it moves, and with what force, is the same at these.
+#: Tasks of seconds; their speeds, distances and forces do not depend on these fields.
 SLOWER = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0)
 
 

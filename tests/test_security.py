@@ -1,4 +1,4 @@
-"""What docs/security.md says: nothing that is read is run, no other machine is listened to."""
+"""Statements of docs/security.md: no input is executed, and no port is open to other machines."""
 
 from __future__ import annotations
 
@@ -35,35 +35,35 @@ RUNS_WHAT_IT_READS = re.compile(
     r"|yaml\.\w*load\w*|np\.(?:load|fromfile|memmap)|Loader=|SourceFileLoader|spec_from\w*"
 )
 EXPLAINED = {
-    # The compiled code of this package, which lies where its .pyc files lie; see the file itself.
+    # Compiled code of the package, in the folders of its .pyc files; see the file itself.
     ("common/compiled.py", "pickle"),
-    # Of NumPy's formats those without objects.
+    # NumPy files without objects.
     ("lab/identified_load.py", "np.load"), ("lab/identified_load.py", "allow_pickle"),
     ("logs/read/table_files.py", "np.load"), ("logs/read/table_files.py", "allow_pickle"),
-    # Results of episodes in the output folder, for a run that continues; processes of our own.
+    # Results of episodes in the output folder, for a continued run; processes of the package.
     ("logs/dataset/dataset.py", "np.load"), ("logs/dataset/dataset.py", "allow_pickle"),
     ("logs/dataset/dataset.py", "joblib"),
-    # One of two names that the code contains.
+    # One of two names in the code.
     ("logs/read/array_files.py", "import_module"),
-    # Processes that this one starts: what they say to each other goes through pipes.
+    # Processes that this one starts; they communicate by pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
-    # A module of the package by its name.
+    # Module of the package by its name.
     ("cli/printing.py", "import_module"),
     ("__init__.py", "import_module"),
     ("robots/connections.py", "import_module"),
-    # polars, on a thread of its own.
+    # polars in a thread of its own.
     ("live/record.py", "import_module"),
-    # The Python file that the user names with --register.
+    # Python file that the user names with --register.
     ("common/registry.py", "import_module"),
-    # A child of this package's own code, with a host's name as its argument.
+    # Child process of this package's code, with a host name as its argument.
     ("robots/rtde.py", "subprocess"),
-    ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
-    # The system's C compiler, with sources of this package and numbers.
+    ("robots/changes.py", "subprocess"),  # the test of the fit, parallel to the loop
+    # C compiler of the system, with sources of the package and numbers.
     ("robots/controller/fmu.py", "subprocess"),
-    ("robots/ros2_node.py", "subprocess"),  # the command `calibrate`
-    # Packages of messages by names that the code contains.
+    ("robots/ros2_node.py", "subprocess"),  # for the command `calibrate`
+    # Packages of messages by names in the code.
     ("robots/ros2.py", "import_module"),
-    # Likewise, with the addresses of a device and of this process.
+    # As above, with the addresses of a device and of this process.
     ("live/device_link.py", "subprocess"),
 }  # fmt: skip
 LISTENS = re.compile(
@@ -73,28 +73,28 @@ LISTENS = re.compile(
 LISTENING = {
     ("station/replay_file.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("lab/studies/processes.py", "Client("),
-    # Who is let in: tests/live/test_server.py.
+    # Access control: tests/live/test_server.py.
     ("live/page_scene.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("live/server.py", "asyncio"),
     ("live/server.py", "socket"),
     ("live/server.py", "serve("),
-    # On this machine, unless the user names another address: tests/robots/test_udp.py.
+    # On this machine, unless the user gives another address: tests/robots/test_udp.py.
     ("robots/udp.py", "socket"),
-    # Connected to the box that was named, which alone is heard; and its page, read once.
+    # Connected to the named sensor box, the only accepted sender; its page is read once.
     ("robots/netft.py", "socket"),
-    # Connected to the drive, which alone is heard; a class of its own.
+    # Connected to the drive, the only accepted sender; separate class.
     ("live/device_client.py", "socket"),
     ("robots/netft.py", "http."),
 }
-"""All that can listen; tests look at the sockets of both."""
+"""All code that can listen; tests check the sockets of both."""
 WRITES = re.compile(
     r"\.write_(?:text|bytes|csv|ipc|json|ndjson)(?=\()|\.(?:write_parquet|save|savefig|touch)(?=\()"
     r"|np\.save\w*|\bopen\(\"[wax]\w*|json\.dump(?=\()|os\.replace"
 )
 WRITING = {
-    # To memory.
+    # Written to memory.
     ("common/style.py", ".savefig"),
-    # What is kept for the next time, whole or not at all; and a temporary folder.
+    # Files for later runs, complete or absent; and a temporary folder.
     ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
     ("common/compiled.py", "os.replace"),
     ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
@@ -102,22 +102,22 @@ WRITING = {
     ("station/slave/model/mjcf_meshes.py", ".write_text"),
     ("station/slave/model/sdf_repair.py", ".write_text"),
     ("station/slave/model_files.py", ".write_text"),
-    # A line for each change of a drive's inputs, which is to outlive the process.
+    # One line for each change of a drive's inputs; it remains after a crash.
     ("live/record.py", 'open("x'),
-    # To memory, and then into the file with the wrenches that have come before.
+    # Written to memory, then to the file after the earlier wrenches.
     ("robots/lines.py", ".write_csv"),
-    # Under another name, until it was read back.
+    # Under a temporary name until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
-    ("robots/controller/fmu.py", ".write_text"),  # a temporary folder, for the compiler
+    ("robots/controller/fmu.py", ".write_text"),  # temporary folder for the compiler
     ("robots/controller/export.py", ".write_bytes"),  # by `whole_file`
-    # Figures, where --json says.
+    # Figures in the file of --json.
     ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `whole_file`; and a dataset that the package generates.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_bytes"),
-    # A mark of one byte more.
+    # A marker of one byte.
     ("lab/studies/store.py", 'open("ab'),
-    ("robots/changes.py", "json.dump"),  # to the process that asked
+    ("robots/changes.py", "json.dump"),  # to the process that requested it
     # Functions of the package that write by `common/files.py`.
     ("lab/run.py", ".save"), ("cli/logs.py", ".save"), ("cli/excitation.py", ".save"),
     ("lab/reproduction/reproduce.py", ".save"), ("lab/reproduction/reproduce.py", ".write_parquet"),
@@ -125,7 +125,7 @@ WRITING = {
 
 
 def found(pattern: re.Pattern[str], folder: Path) -> set[tuple[str, str]]:
-    """File and words of everything in a package that a pattern finds."""
+    """Return file and matched text of a pattern in all files of the package."""
     return {
         (path.relative_to(folder).as_posix(), match.group())
         for path in folder.rglob("*.py")
@@ -140,7 +140,7 @@ def found(pattern: re.Pattern[str], folder: Path) -> set[tuple[str, str]]:
         (RUNS_WHAT_IT_READS, EXPLAINED),
         (LISTENS, LISTENING),
         (WRITES, WRITING),
-        # The command line hides them, so what users have to know is said in another way.
+        # The command line hides warnings, so it reports necessary facts in another way.
         (re.compile(r"\bwarn\("), set()),
     ],
     ids=["run", "listen", "write", "warn"],
@@ -164,7 +164,7 @@ def test_a_line_that_runs_what_it_reads_is_found(tmp_path, line):
 
 
 class Planted:
-    """What makes a folder as soon as somebody unpickles it."""
+    """Object whose unpickling creates a folder."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -200,7 +200,7 @@ def test_a_planted_pickle_is_not_run(tmp_path, name):
             READERS[name](path)
     assert not done.exists()
     pickle.loads(pickle.dumps(Planted(done)))
-    assert done.exists()  # it would have been
+    assert done.exists()  # the folder that unpickling would create
 
 
 STUDY = (
@@ -209,7 +209,7 @@ STUDY = (
 
 
 def test_a_pickle_that_is_planted_in_a_study_is_not_run(tmp_path, monkeypatch):
-    """Under every name that a study has, or ever had."""
+    """Try every file name that a study has or had."""
     monkeypatch.setattr(
         "drake_teleop.lab.studies.study.StationRunFunction.__call__",
         lambda self, values, seed: {"hand_work_J": 1.0},
@@ -271,7 +271,7 @@ USES = re.compile(r"uses: (\S+)@(\S+)  # (v\d+\.\d+\.\d+)")
 
 
 def test_workflows_run_pinned_actions_and_the_job_that_publishes_runs_nothing_else():
-    """A tag can be moved; who may publish must not run the code of this repository."""
+    """Tags can be moved; the publishing job must not execute code of this repository."""
     for path in (ROOT / ".github" / "workflows").glob("*.yml"):
         text = path.read_text()
         assert len(USES.findall(text)) == text.count("uses:")

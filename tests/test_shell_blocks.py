@@ -1,4 +1,4 @@
-"""Every block of shell commands in the pages is typed by a test, or says above itself why not."""
+"""Every shell block of the pages is run by a test, or states above itself why not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shown import shell_blocks, the_block
 
 pytestmark = pytest.mark.checks
 
-#: What a test cannot have, in the words of the pages' comments.
+#: Reasons in the comments of the pages: resources that a test does not have.
 REASONS = {
     "it installs from the network",
     "a robot",
@@ -20,12 +20,12 @@ REASONS = {
 }
 KNOWN = (
     *("<!-- not run by the tests: ", "<!-- run by the tests in small: "),
-    "<!-- the test command -->",  # which .ci/run looks for
+    "<!-- the test command -->",  # for which .ci/run searches
 )
 
 
 def typed() -> set[tuple[str, str]]:
-    """(page, start) of all calls of `type_in` in the tests."""
+    """Return (page, start) of all calls of `type_in` in the tests."""
     return {
         tuple(ast.literal_eval(argument) for argument in node.args[:2])
         for path in Path(__file__).parent.rglob("test_*.py")
@@ -48,7 +48,7 @@ def test_every_command_is_typed_by_a_test_or_it_is_said_why_not():
 
 
 def test_what_is_left_out_has_one_of_few_reasons():
-    """Each of which still has its block; and no comment above a block is misspelt."""
+    """Each reason has a block, and no comment above a block is misspelt."""
     assert {block.left_out for block in shell_blocks() if block.left_out} == REASONS
     for block in shell_blocks():
         for said in block.said.splitlines():

@@ -74,7 +74,7 @@ def test_ports_equal_the_documented_ports(direct):
         absent = ("over a network", "with contact detection")
     for name, side in sides(scenario).items():
         assert ports(side, "in") == written(name, "in", absent)
-        # What is no signal has to be in the contract, and what is in the contract to be there.
+        # The contract contains exactly the ports that are not signals.
         found, agreed = ports(side, "out"), written(name, "out", absent)
         assert {port: size for port, size in found.items() if port not in SIGNALS} == {
             port: size for port, size in agreed.items() if port not in SIGNALS
@@ -85,7 +85,7 @@ def test_ports_equal_the_documented_ports(direct):
 
 
 def test_custom_sides_of_the_docs_work(tmp_path, monkeypatch):
-    """Custom master and recorded slave of docs/station.md."""
+    """Run the custom master and the recorded slave of docs/station.md."""
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     for block in CODE:
@@ -97,7 +97,7 @@ def test_custom_sides_of_the_docs_work(tmp_path, monkeypatch):
     )
     np.testing.assert_allclose(result["pose_command"][:, 4:], start + circle, atol=1e-12)
     assert list(result) == ["pose_command"]
-    # It was made to feel what was felt when the log was recorded.
+    # The hand gets the force that was displayed when the log was recorded.
     simulator = MakeSimulator(names["replayed"], names["scenario"].simulation)
     simulator.AdvanceTo(0.4 + 1e-4)
     station = names["replayed"]
@@ -105,7 +105,7 @@ def test_custom_sides_of_the_docs_work(tmp_path, monkeypatch):
     context = master.GetMyContextFromRoot(simulator.get_context())
     felt = np.linalg.norm(recorded["force_to_master"][:401, :3], axis=1)
     assert master.GetOutputPort("largest_force").Eval(context)[0] == felt.max() > 1.0
-    # Led from outside, the stylus has gone up by nearly what was wanted.
+    # The external intent has raised the stylus by nearly the intended distance.
     assert names["lifted"][6] - names["scenario"].master.position[2] == pytest.approx(
         0.02, abs=5e-3
     )
@@ -156,7 +156,7 @@ def test_intent_without_twist_lags_and_invalid_intent_is_rejected():
     station = MakeTeleopStation(Scenario())
     simulator = MakeSimulator(station, SHORT)
     context, port = simulator.get_mutable_context(), station.GetInputPort("intended_pose")
-    # The size of a quaternion means nothing.
+    # The norm of a quaternion has no meaning.
     port.FixValue(context, [2.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.05])
     intent = station.GetOutputPort("intent").Eval(context)
     np.testing.assert_array_equal(intent, [1.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.05])
@@ -303,7 +303,7 @@ def test_a_controller_without_its_ports_is_one_line(controller, says):
 
 
 def test_a_custom_channel_takes_the_place_of_the_scenarios():
-    """The channel of another scenario, which delays the command."""
+    """Use the channel of another scenario, which delays the command."""
     scenario = replace(LoadScenario("free_motion_force"), **SHORT_RUN)
     delayed = replace(scenario, channel__delay=0.02)
     stations = (
@@ -320,7 +320,7 @@ def test_a_custom_channel_takes_the_place_of_the_scenarios():
 
 @pytest.mark.long
 def test_example_controllers_press_a_wall_without_creating_energy():
-    """Over 50 ms in each direction, at the actual motion; each controller has at most 40 lines."""
+    """Each controller has at most 40 lines; energy is that at the actual motion, 50 ms each way."""
     page = Path(__file__).parents[1] / "docs" / "controllers.md"
     blocks, names = re.findall(r"```python\n(.*?)```", page.read_text(), re.S), {}
     assert max(len(text.splitlines()) for text in blocks if text.startswith("class ")) <= 40
@@ -328,6 +328,6 @@ def test_example_controllers_press_a_wall_without_creating_energy():
     assert len(names["results"]) == 4
     for (_, method), (result, scenario) in names["results"].items():
         assert result["true_contact_wrench_W"][:, 2].max() > 10.0
-        assert result["true_contact_wrench_W"][-1, 2] > 5.0  # it presses to the end
+        assert result["true_contact_wrench_W"][-1, 2] > 5.0  # the hand presses to the end
         # With the initial energy E0. `tdpa` has none and dissipates one hand period late.
         assert injected_energy(result, scenario).min() >= (-1e-6 if method == "tdpa" else 0.0)

@@ -1,7 +1,7 @@
-"""The site that docs/conf.py describes, as far as it can be judged without building it.
+"""Site of docs/conf.py, without building it.
 
-Code that its pages show is run here, or by the test of the page (`TESTED`); commands for a shell
-by those that `test_shell_blocks.py` finds.
+Tests here, or the test of the page (`TESTED`), execute the code that pages show;
+`test_shell_blocks.py` finds the shell commands.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.checks
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-# By a build, from elsewhere.
+# The build downloads it.
 COPIED = {"benchmarks.md", "changelog.md", "contributing.md", "evidence.md"}
 TESTED = {
     "README.md": "tests/test_readme.py",
@@ -73,7 +73,7 @@ links = runpy.run_path(str(DOCS / "_ext" / "formulas.py"))["links"]
     ],
 )
 def test_what_is_loaded_from_elsewhere_is_found(foreign):
-    """The build ends with an error then."""
+    """The build then ends with an error."""
     assert len(loaded_from_elsewhere(f"<p>before</p>{foreign}<p>after</p>")) == 1
 
 
@@ -121,7 +121,7 @@ def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():
 
 
 def test_every_block_says_what_it_is():
-    """Code in one of these languages is run; "text" is a drawing, a file, or what is printed."""
+    """Code in one of these languages is executed; "text" is a drawing, a file or output."""
     assert len(BLOCKS) > 40
     assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text"}
 

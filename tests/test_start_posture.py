@@ -115,13 +115,13 @@ def slave_of(plan, path):
 
 
 def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
-    """The shoulder leans forward and the forearm back up in the middle of the ranges."""
+    """The middle of the ranges has the shoulder forward and the forearm back up."""
     trap = {2: (-1.2, 2.8), 3: (-2.9, 2.6), 5: (-2.9, 2.9)}
     path = write_arm(tmp_path / "arm.urdf", ranges=trap)
     plan = plan_station(path, "ft")
     assert elbow_of(plan) > 0.5
     plan.posture_shapes.move_to(plan.place.q)
-    # The base link has a plate on the plane; everything that moves is above it.
+    # The base link has a plate on the plane; all moving links are above it.
     assert plan.base_plane_height == pytest.approx(0.0, abs=1e-9)
     assert (
         plan.posture_shapes.points_on_bodies(plan.posture_shapes.moving_bodies())[:, 2].min() > 0.02
@@ -219,7 +219,7 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
 
 
 def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
-    """Link 4 overlaps link 2 in most postures; the start avoids it, and no posture hides it."""
+    """Link 4 overlaps link 2 in most postures; the start avoids it, and the check remains."""
     path = write_arm(tmp_path / "arm.urdf", ranges={3: (-2.6, 2.6)})
     plate = '<collision><origin xyz="0 0 -0.02"/><geometry><box size="0.3 0.02 0.4"/></geometry>'
     link = '<link name="link4">'
@@ -328,7 +328,7 @@ def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
 
 @pytest.mark.parametrize("share", [0.5, 1.5])
 def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None:
-    """Unless none can be held; then the error of the station names joint and torque."""
+    """The station's error names joint and torque if no posture can be held."""
     arm = NominalSlave(Slave()).arm
     q = np.random.default_rng(3).uniform(arm.lower, arm.upper, (40, arm.num_joints))
     torque = np.abs([holding_torque(arm, each) for each in q])

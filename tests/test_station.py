@@ -1,4 +1,4 @@
-"""The station of Fig. 4 compared with rigid-body mechanics and the paper."""
+"""Station of Fig. 4 compared with rigid-body mechanics and the paper."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     ("touched", "at_once"),
     [
         ({}, 0),
-        # The hand slower than the motors, whose torques the samples in between depend on.
+        # The hand is slower than the motors, whose torques change between its samples.
         (
             {
                 "sheet_spring": SheetSpring(position=[0.55, 0.0, 0.246]),
@@ -82,7 +82,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
             },
             1,
         ),
-        # Down to the floor, along a wall; what it does to the hand is another question.
+        # Down to the floor, or along a wall; the force at the hand is not tested here.
         (
             {
                 "slot": Slot(position=[0.55, 0.0013, 0.222]),
@@ -94,7 +94,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     ids=["free", "leaf", "slot"],
 )
 def test_wrist_wrench_equals_drakes_reaction_force(slave, touched, at_once):
-    """Compare the sample with the reaction force of the weld in the same state."""
+    """Compare the sample with the weld's reaction force in the same state."""
     scenario = vertical(0.07, 2.5, simulation__settle=0.0, **touched)
     simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
     simulator.Initialize()
@@ -128,17 +128,17 @@ def test_wrist_wrench_equals_drakes_reaction_force(slave, touched, at_once):
     ("name", "most"), [("free_motion_force", 1e-6), ("contact_transition", 0.15)]
 )
 def test_samples_between_steps_equal_those_of_short_steps(name, most):
-    """Steps of 500 us compared with steps of 40 us."""
+    """Compare steps of 500 us with steps of 40 us."""
     scenario = replace(
         LoadScenario(name),
         wrist_sensor__ideal=True,
         simulation__settle=0.0,
         simulation__duration=0.3,
-        operator__intent=[  # down into the leaf, where there is one, and up again
+        operator__intent=[  # down into the leaf, if there is one, and up again
             MinimumJerk(t_start=0.01, duration=0.14, translation=[0.004, 0.003, -0.058]),
             MinimumJerk(t_start=0.19, duration=0.14, translation=[0.0, 0.0, 0.058]),
         ],
-        force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
+        force_scaling__sigma=1.0,  # sigma = 1, so that no load estimate is needed
     )
     tight = replace(scenario, simulation__accuracy=1e-9, simulation__max_step=4e-5)
     result, reference = (simulate(MakeTeleopStation(s), s.simulation) for s in (scenario, tight))
@@ -184,7 +184,7 @@ def felt(slave):
         result = simulate(
             MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
         )
-        t = result.t[:-1]  # one period, its end left out
+        t = result.t[:-1]  # one period without its last sample
         height = result["pose_master"][:-1, 6]
         acceleration = -((2 * np.pi) ** 2) * first_harmonic(height, t, 1.0)
         slave_acceleration = -first_harmonic(result["specific_force_S"][:-1, 2], t, 1.0)
@@ -196,7 +196,7 @@ def felt(slave):
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 1.5])
 def test_apparent_mass_is_device_plus_sigma_times_load(felt, sigma):
-    """m_a = sigma m (section V), here / 17.5 and times the slave's tracking."""
+    """m_a = sigma m (section V), here / 17.5 and times the slave's tracking ratio."""
     hand_0, acceleration_0, _ = felt[0.0]
     hand, acceleration, slave_acceleration = felt[sigma]
     tracking = slave_acceleration / acceleration
@@ -206,7 +206,7 @@ def test_apparent_mass_is_device_plus_sigma_times_load(felt, sigma):
 
 @pytest.mark.slow
 def test_weight_and_inertia_of_the_tool_are_displayed_apart(slave):
-    """Half of the weight at rest, and of the mass under acceleration a tenth."""
+    """Half of the weight is displayed at rest, a tenth of the mass under acceleration."""
     scenario = vertical(
         0.03, 1.0, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.1
     )
@@ -222,28 +222,28 @@ def test_weight_and_inertia_of_the_tool_are_displayed_apart(slave):
 
 @pytest.mark.slow
 def test_apparent_mass_is_the_device_with_sigma_0(felt):
-    """Mass of the device from closed forms, plus the hand's."""
+    """The mass is that of the device by closed forms, plus the hand's."""
     hand, acceleration, _ = felt[0.0]
     q = phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
     grip = OperatorConfig(grip="firm").hand
     M, J = arrays.mass_matrix(q, grip.mass, grip.inertia), arrays.jacobian(q)
-    # A vertical force meets this mass when the stylus is held upright by the wrist.
+    # Mass against a vertical force when the wrist holds the stylus upright.
     inverse_inertia = J @ np.linalg.inv(M) @ J.T
     mass = np.linalg.inv(inverse_inertia)[2, 2]
     assert (hand / acceleration).real == pytest.approx(mass, rel=0.02)
 
 
 def test_energy_balance_of_the_ideal_loop(slave):
-    """Held wrenches and torques have exactly known work over a period."""
+    """Held wrenches and torques do an exactly known work in each period."""
     scenario = vertical(
         0.04, 1.5, rates__log_hz=2000.0, rates__sensor_hz=2000.0, simulation__settle=0.0
     )
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
     )
-    # The log shows each instant before its events: the wrenches at an entry are those that are
-    # then held, the torque at an entry is the one that was held until then.
-    # Master: gravity is compensated, so the rest of the torque works on kinetic energy alone.
+    # The log shows each instant before its events: the wrenches of an entry are held from then on,
+    # its torque was held until then.
+    # Master: gravity is compensated, so the remaining torque changes only the kinetic energy.
     hand, twist = scenario.operator.hand, result["twist_master"]
     held = result["hand_wrench_E"] + result["force_to_master"]
     steps = np.sum(held[:-1] * (twist[1:] + twist[:-1]), axis=1) / 2 / 2000
@@ -256,7 +256,7 @@ def test_energy_balance_of_the_ideal_loop(slave):
     assert np.abs(work).max() > 0.02
     np.testing.assert_allclose(work, kinetic, atol=1e-3 * np.abs(work).max())
 
-    # Slave: motor work = kinetic + potential energy; there is neither contact nor friction.
+    # Slave: motor work = kinetic + potential energy, without contact and friction.
     plant, context = slave.plant, slave.plant.CreateDefaultContext()
     q, v = np.split(result["slave_state"], 2, axis=1)
     stored = []
@@ -322,14 +322,14 @@ def test_the_slave_follows_the_scaled_master(slave):
 
 @pytest.mark.slow
 def test_a_delay_delays_both_directions(slave):
-    # A light load: with sigma = 1 the felt rotational inertia is larger than the hand's and the
-    # device's, and any delay makes the loop unstable.
+    # Light load: with sigma = 1 the displayed rotational inertia exceeds that of hand and device,
+    # and any delay makes the loop unstable.
     scenario = vertical(0.03, 1.0, channel__delay=0.1, force_scaling__sigma=0.1)
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
     )
     lag = round(0.1 / 1e-3)
-    # What is displayed now is minus 1/17.5 of what the sensor felt 0.1 s ago; S points down.
+    # The displayed force is -1/17.5 of the force that the sensor measured 0.1 s ago; S points down.
     displayed, scaled = result["force_to_master"][:, 2], result["scaled_wrench_S"][:, 2]
     np.testing.assert_allclose(displayed[lag:], FORCE_SCALE * scaled[:-lag], atol=2e-4)
     assert np.ptp(FORCE_SCALE * scaled) > 0.01
@@ -349,7 +349,7 @@ def test_an_open_clutch_stops_the_slave(slave):
 
 @pytest.mark.slow
 def test_scales_change_during_a_run_without_force_step(slave):
-    """From sigma 1 at 1/17.5 to 0 at 1/10 during a fast movement."""
+    """Change sigma from 1 to 0 and the force scale from 1/17.5 to 1/10 during a fast movement."""
     scenario = vertical(0.03, 1.0)
     station = MakeTeleopStation(scenario, load_estimate=true_estimate(slave))
     block = GetBlock(station, "force_scaling")
@@ -414,7 +414,7 @@ def test_a_start_out_of_reach_is_one_clear_error():
 
 
 def test_command_far_out_of_reach_is_clamped_and_reported(slave):
-    """No joint leaves its range."""
+    """All joints stay within their ranges."""
     sine = Sine(duration=100.0, ramp=0.5, frequency=0.4, translation=[0.0, 0.06, 0.0])
     scenario = replace(
         Scenario(),
@@ -453,7 +453,7 @@ def test_empty_load_estimate_is_rejected(sigma):
     offsets_alone = np.repeat([1.0, 0.0], [6, 10])
     with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* not identified; identify it"):
         MakeTeleopStation(scenario, load_estimate=offsets_alone)
-    # Of which a learning estimator may begin.
+    # A learning estimator may begin with it.
     learning = replace(scenario, load_estimator__enabled=True)
     MakeTeleopStation(learning, load_estimate=offsets_alone)
 
@@ -478,7 +478,7 @@ def test_joint_range_violation_ends_the_simulation(slave):
     left = r"joint 5 of the slave left its range at \d\.\d+ s"
     with pytest.raises(DrakeTeleopError, match=left) as error:
         simulate(station, scenario.simulation)
-    # What it advises can be had.
+    # The remedy in the message works.
     way, _, servo = re.search(r"(joint_control\.servo)(: )(\w+)", str(error.value)).groups()
     assert replace(scenario, **{way.replace(".", "__"): servo}).joint_control.servo == servo
 
@@ -505,7 +505,7 @@ def test_unreferenced_stations_are_freed(slave):
     ]
     for station in stations[1:]:
         simulate(station, short)
-    # Python's handles of blocks that C++ has made come and go.
+    # Python wrappers of C++ blocks are created and deleted at any time.
     sides = [side for station in stations for side in station.GetSystems()]
     blocks = [block for side in sides if hasattr(side, "GetSystems") for block in side.GetSystems()]
     ours = [system for system in blocks if type(system).__module__.startswith("drake_teleop")]

@@ -18,7 +18,7 @@ from drake_teleop.station.slave.slave_config import Payload, Slave
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])
 def test_offset_drift_does_not_depend_on_the_rate(rate_hz):
-    """The mean of a walk K sqrt(t) over T is K sqrt(T / 3) from its start (Wiener)."""
+    """The mean of a Wiener process K sqrt(t) over T is K sqrt(T / 3) from its start."""
     duration = 10.0
     sensor = WristSensorConfig(
         force_noise=0.1, torque_noise=0.005, force_walk=0.5, torque_walk=0.03,
@@ -32,7 +32,7 @@ def test_offset_drift_does_not_depend_on_the_rate(rate_hz):
     wrench = non_contact_wrench(*motion, slave_arm(scenario).phi_load)
     found = identify_by_batch(scenario, wrench, *motion, rate_hz)
     expected = np.repeat([0.5, 0.03], 3) * np.sqrt(duration / 3)
-    # The load absorbs a small part.
+    # The estimated load absorbs a small part.
     np.testing.assert_allclose(found.standard_deviations[:6], expected, rtol=0.05)
 
 

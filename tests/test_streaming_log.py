@@ -1,4 +1,4 @@
-"""The log that goes to disk while a station runs: the same numbers, and nothing lost."""
+"""Log on disk during a run: equal numbers, and no lost row."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SCENARIO = replace(
     rates__log_hz=4000.0,
     force_scaling__sigma=1.0,
 )
-# Learns while it moves, so that the command has nothing to identify first.
+# The load is estimated during the run, so no identification precedes it.
 ENDLESS = """
 simulation: {duration: 3600.0, settle: 0.05}
 operator:
@@ -79,7 +79,7 @@ def test_the_parts_are_the_log_that_is_kept_in_memory(tmp_path, in_memory):
 
 
 def test_looking_at_the_progress_changes_nothing():
-    """Not even at 0.14 s, which is not 7 times 0.02 s in floating point."""
+    """Include 0.14 s, which is not 7 times 0.02 s in floating point."""
     often = replace(SCENARIO, rates__log_hz=8000.0, simulation__duration=0.25)
     simulator = MakeSimulator(MakeTeleopStation(often), often.simulation)
     simulator.Initialize()
@@ -168,7 +168,7 @@ def test_long_lines_are_drawn_with_their_peaks():
 
 
 def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
-    """Runs ENDLESS until it has written three parts and sends the signal: stderr and status."""
+    """Run ENDLESS, send the signal after three parts; return stderr and exit status."""
     (folder / "endless.yaml").write_text(ENDLESS)
     command = (
         "from drake_teleop.cli.main import main; from drake_teleop.station import simulation;"

@@ -31,7 +31,7 @@ START, END, CONTACT, NOTICED = 0.5, 3.0, 1.5, 1.75  # s, in the log
 SETTLE = 0.25
 
 
-@functools.cache  # what it compiles is not for each worker to compile while it collects
+@functools.cache  # compiled in the test, not by each worker during collection
 def home():
     return home_posture(slave_arm(Scenario()), Scenario().slave.position)
 
@@ -43,7 +43,7 @@ def measures(task, **log):
 def run(
     task, *, done: float = 1.0, force: float = 6.0, early: bool = False, phase: int = PHASE_MOVING
 ):
-    """Return a log of a hand force of 2 N at 0.1 m/s back and forth, with contact from CONTACT on.
+    """Return a log with a hand force of 2 N at 0.1 m/s back and forth, and contact from CONTACT on.
 
     The tool stays at its start.
     """
@@ -77,7 +77,7 @@ def test_measures_of_a_touch():
     assert found["task_time_s"] == pytest.approx(END - START)
     assert found["contact_force_overshoot_N"] == pytest.approx(6.0)
     assert found["effort_Ns"] == pytest.approx(2.0 * (END - START))
-    # Forwards and backwards both cost: the net work would be less.
+    # Both directions cost effort: the net work would be less.
     assert found["task_work_J"] == pytest.approx(0.2 * (END - START))
     assert found["detection_time_s"] == pytest.approx(NOTICED - CONTACT)
     assert found["false_notices"] == 0.0
@@ -93,7 +93,7 @@ def test_measures_of_a_press():
 
 
 def test_failed_task_has_nan_measures():
-    """Given up, or finished without success."""
+    """The task was given up, or ended without success."""
     for found in (
         measures(Press(force=5.0, tolerance=0.5)),
         measures(Press(force=5.0, tolerance=2.0), done=-1.0),
@@ -112,7 +112,7 @@ def test_measures_of_a_given_up_task():
 AT = {"t_start": START + SETTLE}
 FAR = "the tip 100.0 mm from the target"
 FAILURES = {
-    # Its operator is content, the truth is not.
+    # The operator reports success, the true state differs.
     "at 3.00 s, but the tool pressed with 6.00 N, not 5 ± 0.5 N": (
         Press(force=5.0, tolerance=0.5),
         {},
@@ -120,14 +120,14 @@ FAILURES = {
     f"but the tool touches nothing, {FAR}": (Touch(), {"force": 0.0}),
     "but the tip is 100.0 mm from the target, not 5 mm": (Reach(), {}),
     "but the tip is 140.0 mm above the floor": (Insert(), {}),
-    # It gives up.
+    # The operator gives up.
     f"at 3.00 s, after the 2.5 s of its timeout, while pressing, {FAR}, 6.0 N at the tool instead"
     " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PHASE_PRESSING}),
     f"at 3.00 s: it saw the tool far beyond the surface and detected no contact, {FAR}, 0.0 N": (
         Touch(**AT),
         {"done": -1.0, "phase": PHASE_APPROACHING, "force": 0.0},
     ),
-    # The log ends before.
+    # The log ends before the task.
     f"after 3.50 s of the task, while the operator was searching for the slot, {FAR}": (
         Insert(**AT),
         {"done": 0.0, "phase": PHASE_SEARCHING_SLOT},

@@ -175,7 +175,7 @@ def identified():
 def test_huge_file_is_not_read_completely(monkeypatch, tmp_path):
     monkeypatch.setattr("drake_teleop.common.texts._MAX_YAML_VALUES", 100)
     path = tmp_path / "x.yaml"
-    expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
+    expected = "(line 201: there are more than 100 values)"  # but not a bracket that is not closed
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")
 
 

@@ -1,4 +1,4 @@
-"""docs/theory.md: every formula has a number, and every number a function that exists."""
+"""docs/theory.md: every formula has a number, and every number an existing function."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NUMBER = re.compile(r"\((T?\d+)\)")
 
 @cache
 def defined(path: Path) -> set[str]:
-    """Functions and classes of a module, and "Class.method"."""
+    """Return functions, classes and methods ("Class.method") of a module."""
     names = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):

@@ -108,13 +108,13 @@ def test_impossible_folder_raises_one_line(tmp_path, monkeypatch):
     for folder, reason in (("file", "File exists"), ("file/x", "Not a directory")):
         with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
             make_folder(tmp_path / folder)
-    monkeypatch.setattr(os, "access", lambda path, mode: False)  # which root never sees
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root can always read
     with pytest.raises(CannotWrite, match="is a folder without write permission; give another"):
         make_folder(tmp_path)
 
 
 def test_last_file_marks_a_complete_folder(tmp_path):
-    """It is removed first and written last; the error lists the new files."""
+    """The last file is removed first and written last; the error lists the new files."""
     out = tmp_path / "Käse und Brot"
     for name in ("summary.json", "earlier", "a"):
         make_folder(out)
@@ -162,12 +162,12 @@ COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "study": (study, 6, "keeps 1 of 2 runs; repeat the command"),
     "sample-log": (sample_log, 8, "keeps free.yaml, free_wrench.csv"),
 }
-"""Each command, the files that it writes, and what it says when the third one has no room."""
+"""Commands, their files, and their message if the disk is full at the third file."""
 
 
 @pytest.fixture
 def little_work(monkeypatch):
-    """Replace the work of the commands, which still write all files."""
+    """Replace the computations of the commands, which still write all files."""
     monkeypatch.setattr(runs, "run_scenario", a_run)
     monkeypatch.setattr(runs, "summarise", lambda run: {"x": float("nan")})
     monkeypatch.setattr(runs, "draw_overview", lambda result: Figure())
@@ -200,7 +200,7 @@ def test_full_disk_at_any_file(tmp_path, monkeypatch, little_work, name):
         if write == 2:
             assert third in said
         there = {path for path in out.rglob("*") if path.is_file()}
-        lone = name == "run" and write == 1  # the scenario alone is of no use
+        lone = name == "run" and write == 1  # the scenario alone is incomplete
         assert there == (set() if lone else set(named))
         assert not (out / "summary.json").exists()
         for path in there:
@@ -238,7 +238,7 @@ def test_run_that_fails_early_leaves_no_files(tmp_path, monkeypatch):
     with pytest.raises(DrakeTeleopError):
         run(tmp_path)
     assert list(tmp_path.iterdir()) == []
-    mine = tmp_path / "scenario.yaml"  # which is somebody's own
+    mine = tmp_path / "scenario.yaml"  # file of the user
     mine.write_text("description: mine\n")
     with pytest.raises(DrakeTeleopError):
         runs.run_command(mine, tmp_path, quiet=True)

@@ -1,4 +1,4 @@
-"""Wrong types and shapes from Python are one DrakeTeleopError, as they are from YAML."""
+"""Wrong types and shapes from Python raise one DrakeTeleopError, as from YAML."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from drake_teleop.station.simulation import simulate
 N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
 NAME: Any = "free_motion_force"
 HALF: Any = "half"
-FOUND: Any = SimpleNamespace(estimate=np.ones(16))  # such as identify_load gives
+FOUND: Any = SimpleNamespace(estimate=np.ones(16))  # like the result of identify_load
 LOADED: Any = {"load_estimate": np.ones(16)}
 
 
@@ -38,9 +38,9 @@ def with_value(path: str, value: object) -> Callable[[], Any]:
     return lambda: replace(dt.Scenario(), **{path: value}).check()
 
 
-#: By what is wrong: the call, and where the message says that it is.
+#: Kind of mistake: the call, and the place in the message.
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
-    # A word, a list, a tuple, an array, a flag where another kind belongs, as from YAML.
+    # A word, list, tuple, array or flag in place of another kind, as from YAML.
     "a word for a number": (with_value("force_scaling__sigma", "half"), "force_scaling.sigma"),
     "a numeral": (with_value("force_scaling__sigma", "0.5"), "force_scaling.sigma"),
     "a list for a number": (with_value("force_scaling__eta", [0.5]), "force_scaling.eta"),
@@ -57,7 +57,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "a word for a block": (with_value("force_scaling", "half"), "force_scaling"),
     "a wrong block": (with_value("operator__task", dt.Scenario()), "operator.task"),
     "a word in a list of blocks": (with_value("operator__intent", ["up"]), "operator.intent[0]"),
-    # A name, or nothing, where a scenario belongs.
+    # A name or None in place of a scenario.
     "MakeTeleopStation": (lambda: dt.MakeTeleopStation(NAME), "scenario"),
     "MakeIdentificationStation": (lambda: dt.MakeIdentificationStation(NAME, NAME), "scenario"),
     "identify_load": (lambda: dt.identify_load(NAME), "scenario"),
@@ -130,7 +130,7 @@ def test_what_is_wrong_is_one_line_that_says_where(what: str) -> None:
 
 
 def test_every_public_function_is_tried() -> None:
-    """A function that is new in the package's list is missing here until it is tried as well."""
+    """A new public function fails here until it has a case."""
     functions = [name for name in dt.__all__ if callable(getattr(dt, name))]
     with open(__file__, encoding="utf-8") as file:
         text = file.read()

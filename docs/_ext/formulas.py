@@ -1,7 +1,7 @@
-"""Links: "(T12)" and "Eq. (13)" lead to the formula, and theory's index of formulas to code.
+"""Links from "(T12)" and "Eq. (13)" to the formula, and from the index of formulas to the code.
 
-Formulas in a display have their ids from `mathml`; a number that stands in running text gives its
-paragraph the id.
+Displayed formulas get their ids from `mathml`. A formula number in running text gives its paragraph
+the id.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NUMBER = re.compile(r"\((T?\d+)\)")
 
 
 def links(text: str) -> list[tuple[str, str]]:
-    """The text in pieces, each with the id of the formula that it names, or ""."""
+    """Split the text; return each piece with the id of the formula that it names, or ""."""
     pieces, last = [], 0
     for said in _SAID.finditer(text):
         for found in _NUMBER.finditer(text, *said.span()):
@@ -34,7 +34,7 @@ def links(text: str) -> list[tuple[str, str]]:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Marks and asks for links when a page is read, makes those to formulas when it is written."""
+    """Add ids and links to code when a page is read, links to formulas when it is written."""
     app.connect("doctree-read", _read)
     app.connect("doctree-resolved", _resolved)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
@@ -58,7 +58,7 @@ def _read(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def _link_to_code(literal: nodes.literal, target: str) -> None:
-    """To the reference, where it has the name: what begins with an underscore is not in it."""
+    """Link a name to the reference, which does not contain names with a leading underscore."""
     link = pending_xref(
         "", refdomain="py", reftype="obj", reftarget=target, refexplicit=True, refwarn=False
     )

@@ -1,4 +1,4 @@
-"""The gallery: its order, the look of its pictures, and which picture is whose."""
+"""Gallery: order of its scripts, plot style, and the picture of each script."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def set_style(_settings: dict[str, Any], _file: str) -> None:
 
 
 def picture(_block: Any, names: dict[str, Any], settings: dict[str, Any]) -> str:
-    """What a script has made as `figure`, whether it is pyplot's or not."""
+    """Save the object `figure` of a script as its picture, with or without pyplot."""
     path = Path(next(names["image_path_iterator"]))
     figure = names["example_globals"]["figure"]
     figure.savefig(path, dpi=PAGE_DPI)
@@ -31,7 +31,7 @@ def picture(_block: Any, names: dict[str, Any], settings: dict[str, Any]) -> str
 
 
 class Order:
-    """As one would tell it; a script that is not named here is an error."""
+    """Order of the gallery's scripts; a script that is not listed here is an error."""
 
     STORY = (
         *(
@@ -59,12 +59,12 @@ class Order:
     )
 
     def __init__(self, folder: str) -> None:
-        """Of the scripts in a folder."""
+        """Accept the folder of scripts, which is not used."""
 
     def __call__(self, name: str) -> int:
-        """The place of a script."""
+        """Return the position of a script."""
         return self.STORY.index(Path(name).stem)
 
     def __repr__(self) -> str:
-        """The same at every build, so that the second finds the first's pictures."""
+        """Return the same text in every build, so that a second build reuses the pictures."""
         return f"<{self.STORY}>"

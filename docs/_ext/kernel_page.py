@@ -1,7 +1,7 @@
 """The compensation kernel as WebAssembly, for the page `browser.md`.
 
-The C code of `drake-teleop export --to c99` is compiled by the clang of `ziglang` (extra `docs`)
-into `_static/kernel.js`, which the page loads from the site itself, or from a file.
+The clang of `ziglang` (extra `docs`) compiles the C code of `drake-teleop export --to c99` into
+`_static/kernel.js`. The page loads this file from the site or from disk.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __attribute__((export_name("step"))) unsigned step(void) {
 """
 _EXPORTS = [f"-Wl,--export={name}" for name in ("load", "reading", "result")]
 _TARGET = ("-target", "wasm32-freestanding", "-nostdlib", "-s", "-Wl,--no-entry")
-# The page gives load and low-pass.
+# The page sets load and low-pass.
 _ANY_LOAD = ControllerTarget(
     Identification(
         *(np.ones(10), np.zeros(6), np.zeros((16, 16)), np.ones(16, bool), 1.0, 0.0, np.zeros(6)),
@@ -60,7 +60,7 @@ _ANY_LOAD = ControllerTarget(
 
 
 def compiled(target: ControllerTarget = _ANY_LOAD) -> bytes:
-    """WebAssembly of the kernel, with the limits of `target`."""
+    """Return the kernel as WebAssembly, with the limits of `target`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in {**kernel_files(target), "step.c": STEP}.items():
@@ -72,7 +72,7 @@ def compiled(target: ControllerTarget = _ANY_LOAD) -> bytes:
 
 
 def script() -> str:
-    """JavaScript that contains the module; a page from a file cannot fetch another file."""
+    """Return JavaScript that contains the module: a page on disk cannot fetch other files."""
     return f'const KERNEL = "{base64.b64encode(compiled()).decode()}";\n'
 
 

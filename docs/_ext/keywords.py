@@ -1,6 +1,6 @@
-"""Words that people look for, and the section that answers: the search puts it first.
+"""Search words, and the section that the site's search lists first for each.
 
-They stand here and not in the pages, whose Markdown is read elsewhere too.
+They are here and not in the pages, because other tools read the Markdown too.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.transforms import SphinxTransform
 
-#: By page and id of its section.
+#: Search words by page and id of the section.
 KEYWORDS = {
     "analysis": {
         "what-each-criterion-means": "Llewellyn, Raisbeck, absolute stability, Z-width, Nyquist",
@@ -58,12 +58,12 @@ KEYWORDS = {
 
 
 class Keywords(SphinxTransform):
-    """Enters them into the index, before Sphinx collects it."""
+    """Transform that adds the search words to the index, before Sphinx collects it."""
 
     default_priority = 500
 
     def apply(self, **_options: Any) -> None:
-        """Of the page that is read.
+        """Add the search words of the page.
 
         Raises:
             ExtensionError: for a section that the page does not have.
@@ -81,6 +81,6 @@ class Keywords(SphinxTransform):
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Registers the transform."""
+    """Register the transform."""
     app.add_transform(Keywords)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,7 +1,7 @@
-"""A name that ends as no name of the reference does is not looked for among all of them.
+"""Python domain that skips the search for names whose last part is not in the reference.
 
-Sphinx asks of each type in a signature, such as `float`, whether any of thousands of names ends in
-it; that took a fifth of a build, in the one process that hands pages out to the others.
+Sphinx compares each type in a signature, such as `float`, with the ends of thousands of names. This
+takes a fifth of a build, in the process that the others wait for.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from sphinx.domains.python import PythonDomain
 
 
 class KnownNames(PythonDomain):
-    """The domain of Python, which finds what Sphinx's own does."""
+    """Python domain with the same results as that of Sphinx."""
 
     _last: tuple[int, frozenset[str]] = (0, frozenset())
-    """How many names there were, and what they end in behind the last dot."""
+    """Number of names, and their parts after the last dot."""
 
     def find_obj(self, env: Any, modname: Any, classname: Any, name: str, *how: Any) -> list[Any]:
-        """As Sphinx does it."""
+        """Return the same objects as Sphinx's method."""
         if self._last[0] != len(self.objects):
             ends = frozenset(known.rpartition(".")[2] for known in self.objects)
             self._last = len(self.objects), ends
@@ -29,6 +29,6 @@ class KnownNames(PythonDomain):
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Takes the place of Sphinx's own."""
+    """Replace the domain of Sphinx."""
     app.add_domain(KnownNames, override=True)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

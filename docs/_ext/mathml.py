@@ -1,4 +1,4 @@
-"""Formulas as MathML, which every browser draws: no script, no font, nothing to load."""
+"""Formulas as MathML, which browsers draw without a script or font."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MATRIX = re.compile(r"<mo>&#x0005B;</mo><mtable>(.*?)</mtable><mo>&#x0005D;</mo
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Makes it the renderer of formulas."""
+    """Register the renderer of formulas."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -25,7 +25,7 @@ def _inline(translator: Any, node: nodes.math) -> None:
 
 
 def _block(translator: Any, node: nodes.math_block) -> None:
-    """A formula of its own, with its number at the right if it has a tag."""
+    """Write a displayed formula; its tag becomes the number at the right."""
     text = node.astext()
     tag = _TAG.search(text)
     formula = _mathml(_TAG.sub("", text).strip(), display="block")
@@ -36,5 +36,5 @@ def _block(translator: Any, node: nodes.math_block) -> None:
 
 
 def _mathml(formula: str, **options: str) -> str:
-    """With brackets about matrices that the style sheet draws: not every font has high ones."""
+    """Convert a formula; the style sheet draws matrix brackets, as some fonts lack tall ones."""
     return _MATRIX.sub(r'<mtable class="matrix">\1</mtable>', convert(formula, **options))

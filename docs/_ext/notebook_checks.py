@@ -1,8 +1,8 @@
-"""What the notebooks promise: run behind each of them when the site is built, and not shown."""
+"""Hidden checks of the notebooks, executed after each of them when the site is built."""
 
 from __future__ import annotations
 
-#: What must hold once a notebook has run, in its own variables.
+#: Assertions by notebook, about its variables.
 CHECKS = {
     "01_quickstart": """
 assert abs(load.mass - 3.13) < 0.01
@@ -30,11 +30,11 @@ assert min(over_300_ms[name].least_energy_sum(ACTUAL) for name in ("wave", "pspm
 assert other_hands["none"].release_speed > 1.0 > 3 * other_hands["ledger"].release_speed
 assert other_hands["ledger"].leaked == 0.0 < other_hands["tdpa"].leaked
 assert np.ptp(age["playout 150 ms"][400:]) < 1e-9 and np.ptp(age["internet"][400:]) > 0.02
-assert difference == 0.0 and np.abs(through_buffer.felt).max() > 0.5
+assert difference == 0.0 and np.abs(through_buffer.hand_force).max() > 0.5
 silent = (cut.t > 8.31) & (cut.t < 9.04)
-assert np.abs(cut.felt[silent]).max() == 0.0 and np.ptp(cut.command[silent]) == 0.0
-assert np.abs(cut.felt[8000]) > 0.5 and np.abs(cut.felt[11000]) > 0.5
-assert np.abs(np.diff(cut.felt[7500:11000])).max() < 0.5
+assert np.abs(cut.hand_force[silent]).max() == 0.0 and np.ptp(cut.command_position[silent]) == 0.0
+assert np.abs(cut.hand_force[8000]) > 0.5 and np.abs(cut.hand_force[11000]) > 0.5
+assert np.abs(np.diff(cut.hand_force[7500:11000])).max() < 0.5
 assert covering[0.0][0].max() == 0.0 and (np.diff(covering[0.0], axis=0) > 0.1).all()
 assert np.ptp(covering[5100.0][:, 1:], axis=0).max() < 1e-3  # the same for every sigma
 assert (np.diff(longest) > 0.0).all()

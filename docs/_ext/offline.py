@@ -1,4 +1,4 @@
-"""Nothing that a page needs comes from elsewhere, so that the site can be read offline."""
+"""Check that the pages load nothing from other servers, so that the site works offline."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _LOADED = re.compile(
 
 
 def loaded_from_elsewhere(text: str) -> list[str]:
-    """What a page or a style sheet loads from other servers; links to click on are not of it."""
+    """Return the addresses on other servers that a page or style sheet loads, without its links."""
     return [found[0] for found in _LOADED.finditer(text)]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Looks at all that was written when a build is finished."""
+    """Check all written files at the end of a build."""
     app.connect("build-finished", _check)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 

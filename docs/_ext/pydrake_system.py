@@ -1,4 +1,4 @@
-"""`.. pydrake_system::` in docstrings: a block with its ports, drawn as Drake's own pages do."""
+"""Directive `.. pydrake_system::` of docstrings: a block with its ports, as Drake draws it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ PORTS = ("input_ports", "output_ports")
 
 
 class PydrakeSystem(Directive):
-    """A name, `input_ports:` and `output_ports:`, one port in a line: `- name: what it is`."""
+    """Name, `input_ports:` and `output_ports:` of a system, one port per line: `- name: signal`."""
 
     has_content = True
 
     def run(self) -> list[nodes.Node]:
-        """The block, and below it what each port carries."""
+        """Return the drawn block, and the list of its ports with their signals."""
         name, ports = _read(list(self.content))
         left, right = (
             "".join(f"<span>{escape(port)}</span>" for port, _ in ports[kind]) for kind in PORTS
@@ -32,21 +32,21 @@ class PydrakeSystem(Directive):
             for kind in PORTS
             for port, text in ports[kind]
         )
-        # Where it is wider than the page it scrolls, by keys too.
+        # A block that is wider than the page scrolls, also by keys.
         table = f'<table class="ports" tabindex="0"><tbody>{rows}</tbody></table>'
         return [nodes.raw("", block + table, format="html")]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Registers the directive."""
+    """Register the directive."""
     app.add_directive("pydrake_system", PydrakeSystem)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 def _read(lines: list[str]) -> tuple[str, dict[str, list[tuple[str, str]]]]:
-    """The system's name and its ports, each with what it carries.
+    """Return the system's name and its ports, each with its signal.
 
-    No YAML, though it looks like it: what a port carries is said in words, colons and brackets.
+    The text is not parsed as YAML, because descriptions of signals contain colons and brackets.
     """
     name, ports, kind = "", {kind: [] for kind in PORTS}, ""
     for line in filter(None, map(str.strip, lines)):

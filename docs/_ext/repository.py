@@ -1,7 +1,7 @@
-"""What lies beside `docs` in the repository comes into the site: notebooks, changes, evidence.
+"""Pages of the site from outside of `docs`: notebooks, changelog, evidence.
 
-They are copied before a build reads anything, and links between them and `docs` are made to fit:
-written so as to be right in the repository, they are right on the site as well.
+They are copied before a build reads the sources. Links between them and `docs` are correct in the
+repository; they are changed so that they are correct on the site too.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from sphinx.environment import BuildEnvironment
 
 DOCS = Path(__file__).parents[1]
 ROOT = DOCS.parent
-#: Pages of the site whose source is elsewhere.
+#: Pages of the site whose source is outside of `docs`.
 PAGES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "benchmarks/README.md": "benchmarks.md",
 }
-#: What links begin with in the repository, and on the site.
+#: Beginnings of links in the repository, and on the site.
 LINKS = {
     "](../docs/": "](../",
     "](docs/": "](",
@@ -35,7 +35,7 @@ LINKS = {
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Copies as soon as the settings are read, before Sphinx looks for sources."""
+    """Copy the files after the settings are read, before Sphinx looks for sources."""
     app.connect("config-inited", _copy)
     app.connect("env-before-read-docs", _spread)
     app.connect("source-read", _pages_link)
@@ -53,7 +53,7 @@ def _copy(_app: Sphinx, _config: Config) -> None:
 
 
 def _spread(_app: Sphinx, _env: BuildEnvironment, pages: list[str]) -> None:
-    """Notebooks stand far from each other: a process reads, and runs, neighbours one by one."""
+    """Distribute notebooks among the pages: a process reads neighbouring pages in sequence."""
     notebooks = [page for page in pages if page.startswith("notebooks/")]
     others = [page for page in pages if page not in notebooks]
     apart = len(others) // max(len(notebooks), 1)
@@ -63,7 +63,7 @@ def _spread(_app: Sphinx, _env: BuildEnvironment, pages: list[str]) -> None:
 
 
 def _evidence() -> str:
-    """What `benchmarks/evidence.py` says of the records that are kept."""
+    """Return the page of `benchmarks/evidence.py` about the stored records."""
     sys.path.insert(0, str(ROOT / "benchmarks"))
     try:
         return importlib.import_module("evidence").page()
@@ -72,7 +72,7 @@ def _evidence() -> str:
 
 
 def _checked(path: Path) -> nbformat.NotebookNode:
-    """With its checks as a last cell that is run, and not shown."""
+    """Return the notebook with its checks in a last cell, which is executed and hidden."""
     notebook = nbformat.read(path, as_version=4)
     check = nbformat.v4.new_code_cell(
         CHECKS[path.stem], id="checks", metadata={"tags": ["remove-cell"]}
@@ -82,7 +82,7 @@ def _checked(path: Path) -> nbformat.NotebookNode:
 
 
 def _write(path: Path, text: str) -> None:
-    """Only what is new, so that a second build finds the rest unchanged."""
+    """Write a file only if its content changes, so that a second build reuses the rest."""
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.write_text(text, encoding="utf-8")
 

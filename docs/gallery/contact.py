@@ -2,8 +2,8 @@
 Contact: no threshold on the measured force finds it
 ====================================================
 
-The paper's Fig. 8. The tool touches a sheet spring in the middle of a fast swing (shaded: the truth
-of the simulation). In the measured force the touch is smaller than the swing around it.
+The paper's Fig. 8. The tool touches a sheet spring in the middle of a fast swing (shaded: true
+contact of the simulation). The contact force is smaller than the inertial force around it.
 """
 
 import matplotlib.pyplot as plt

@@ -1,9 +1,9 @@
 """
-A wrong description, found out
-==============================
+Errors in a log description
+===========================
 
-The sample log's description is spoiled in four ways. Each time the laws of motion no longer fit
-(with a wrong sign they fit a negative mass), and the finding names the line that mends it.
+The sample log's description gets four errors, one at a time. Each of them contradicts the laws of
+motion (a wrong sign gives a negative mass), and the finding names the line that fixes it.
 """
 
 import tempfile

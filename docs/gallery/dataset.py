@@ -2,8 +2,9 @@
 Clean wrench for robot learning
 ===============================
 
-A dataset of five episodes at 30 frames a second, each a table. In one episode the wrench is turned
-by 90 degrees and negated. The command names it, and writes the contact wrench of all episodes.
+A dataset of five episodes at 30 frames per second, one table for each. In one episode the wrench is
+rotated by 90 degrees and negated. The command names this fault and writes the contact wrench of all
+episodes.
 """
 
 import tempfile

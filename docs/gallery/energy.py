@@ -2,8 +2,8 @@
 A network creates energy
 ========================
 
-What hand and wall have put into a station without a passivity method, and with the ledger, over a
-round trip of 50 ms. Below zero the station has given out more than it was given.
+Energy that hand and wall put into a station, without a passivity method and with `ledger`, over a
+round trip of 50 ms. Below zero, the station has delivered more energy than it received.
 """
 
 import matplotlib.pyplot as plt

@@ -1,9 +1,10 @@
 """
-An excitation for an arm of your own
-====================================
+Excitation trajectory for your arm
+==================================
 
 For any URDF or SDF of a serial arm, here :download:`arm.urdf </gallery/arm.urdf>`. The trajectory
-shows all that a load has, respects the limits of joints and sensor, and begins and ends at rest.
+excites all ten load parameters, respects the limits of joints and sensor, and begins and ends at
+rest.
 """
 
 from pathlib import Path

@@ -2,8 +2,8 @@
 Displayed impedance, by frequency
 =================================
 
-The impedance at the hand in free motion and on a wall, sampled, for three values of sigma. Dotted:
-that of an ideal station.
+Impedance at the hand in free motion and on a wall, by the sampled model, for three values of sigma.
+Dotted: ideal station.
 """
 
 from dataclasses import replace

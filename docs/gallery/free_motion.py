@@ -1,9 +1,9 @@
 """
-Free motion: 100 N, and nothing is touched
-==========================================
+Free motion: 100 N without contact
+==================================
 
-The paper's Fig. 6. A fast hand swings a tool of 3 kg; the wrist sensor reads its weight and
-inertia. What is left of that once the identified load is taken away is noise.
+The paper's Fig. 6. A fast hand swings a tool of 3 kg; the wrist sensor measures its weight and
+inertia. After elimination of the identified load only noise remains.
 """
 
 import matplotlib.pyplot as plt

@@ -1,10 +1,10 @@
 """
-Something heavy is grasped
-==========================
+Grasping a heavy object
+=======================
 
-The tool holds 0.8 kg. With the load of the empty tool the object's weight and inertia reach the
-hand; with the load identified anew they do not. What was grasped is the difference of the two, Eq.
-(14).
+The tool holds 0.8 kg. With the load of the empty tool, the object's weight and inertia are
+displayed; with the newly identified load they are not. The object is the difference of the two
+loads, Eq. (14).
 """
 
 import matplotlib.pyplot as plt

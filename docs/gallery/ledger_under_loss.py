@@ -2,9 +2,9 @@
 The ledger while packets are lost
 =================================
 
-A third of all packets is lost, in bursts of 50 ms, on a round trip of 100 ms. The books of the
-ledger hold nevertheless, for its counters are cumulative: the next packet has all that the lost
-ones had.
+A third of all packets is lost, in bursts of 50 ms, over a round trip of 100 ms. The energy balance
+of `ledger` remains correct, because its counters are cumulative: the next packet includes the
+energy of all lost ones.
 """
 
 import matplotlib.pyplot as plt
@@ -16,8 +16,8 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 lossy = NetworkConfig(delay=0.05, jitter=0.3, loss=0.33, burst=0.05, burst_loss=0.9)
 run = run_one_dof(REFERENCE, PassivityConfig(method="ledger"), lossy)
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)
-above.plot(run.t, REFERENCE.force_scale * run.wall, label="wall / 17.5", color="grey")
-above.plot(run.t, run.felt, label="displayed")
+above.plot(run.t, REFERENCE.force_scale * run.wall_force, label="wall / 17.5", color="grey")
+above.plot(run.t, run.hand_force, label="displayed")
 above.set(ylabel="force at the hand [N]")
 above.legend()
 energy = run.start_energy + run.accounts[:, HAND] + run.accounts[:, ACTUAL]

@@ -2,8 +2,8 @@
 The hand lets go while it presses
 =================================
 
-The device is left alone with a force that is a round trip old (100 ms). Every method but none
-fades what would throw it away.
+The device without a hand receives a force that is one round trip (100 ms) old. Every method except
+`none` fades the part of it that would accelerate the device.
 """
 
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ from drake_teleop.lab.comparison.one_dof import OneDof, Task, operator_intent, r
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
-model, gone = OneDof(), 3000  # the station's grip and servo; ms
+model, gone = OneDof(), 3000  # grip and servo of the station; ms
 task = Task(0.1, 0.6, 0.7, 1.5, release_start=9.0, release_end=10.0, end=4.0, rest_window=0.1)
 intent = operator_intent(task)
 grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(intent), 1))
@@ -22,7 +22,9 @@ figure, axes = plt.subplots(figsize=(7, 3.5))
 for method in ("none", "tdpa", "charged_tdpa", "ledger"):
     passivity = PassivityConfig(method=method)
     run = run_one_dof(model, passivity, PRESETS["internet"], intent=intent, grip=grip)
-    axes.plot(run.t - run.t[gone], 1e3 * (run.master - run.master[gone]), label=method)
+    axes.plot(
+        run.t - run.t[gone], 1e3 * (run.master_position - run.master_position[gone]), label=method
+    )
 axes.set(xlabel="t after letting go [s]", ylabel="way of the device [mm]")
 axes.set(xlim=(-0.2, 0.8), ylim=(-120, 20))
 axes.legend()

@@ -2,8 +2,8 @@
 A drive, and the network that changes in contact
 ================================================
 
-A script moves the hand here, instead of a mouse in `drake-teleop drive`. The hand presses on the
-leaf. At 1.5 s the network becomes `internet` with a passivity method, at 2.5 s σ becomes 0.5.
+A script moves the hand, as a mouse does in `drake-teleop drive`. The hand presses on the leaf. At
+1.5 s the network becomes `internet` with a passivity method, at 2.5 s σ becomes 0.5.
 
 .. image:: /figures/drive.webp
    :alt: A drive in the browser: free motion, a press on the leaf, and σ to 1 and back

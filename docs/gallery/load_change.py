@@ -1,8 +1,8 @@
 """
-A gripper takes up an object
-============================
+A gripper grasps an object
+==========================
 
-At 5 s the moving tool takes up 0.8 kg. The watch distinguishes it from a touch, and identifies it.
+At 5 s the moving tool grasps 0.8 kg. The estimator distinguishes it from contact and identifies it.
 """
 
 import matplotlib.pyplot as plt
@@ -18,7 +18,7 @@ held = phi_from_mass_com_inertia(0.8, [0.04, 0, 0.16], np.diag([8e-4, 8e-4, 4e-4
 rng, t, dt = np.random.default_rng(1), np.arange(0, 15, 1e-3), 1e-3
 tilt = 0.4 * np.sin(np.outer(t, [4.0, 5.2]))
 omega = np.zeros((len(t), 3))
-omega[:, :2] = np.gradient(tilt, dt, axis=0)  # small turns about x and y, slow ones about z
+omega[:, :2] = np.gradient(tilt, dt, axis=0)  # small rotations about x and y, slow ones about z
 omega[:, 2] = 0.9 * np.sin(3.1 * t)
 alpha = np.gradient(omega, dt, axis=0)
 s = 9.81 * np.stack([-tilt[:, 1], tilt[:, 0], np.ones(len(t))], axis=1)

@@ -1,9 +1,9 @@
 """
-When was the robot touched?
-===========================
+Contacts in a robot's log
+=========================
 
-A second record of the same gripper: somebody pushes at it three times. The load's own wrench is
-taken away, and contact is what stands out of the noise floor of free motion.
+In a second record of the same gripper, a person pushes it three times. The load's wrench is
+eliminated; contact is detected where the remaining wrench exceeds the noise floor of free motion.
 """
 
 import tempfile

@@ -2,8 +2,8 @@
 A load from a robot's log
 =========================
 
-The sample log is of an arm with a gripper, recorded by two clocks, in lbf and degrees, with the
-sensor's sign the other way. Its description says so, and this finds what hangs on the sensor.
+The sample log is of an arm with a gripper. It has two clocks, lbf and degrees, and the opposite
+sign of the wrench; its description states this. Identification gives the load on the sensor.
 """
 
 import tempfile

@@ -1,9 +1,9 @@
 """
-Networks: how old is what arrives?
+Networks: age of the newest packet
 ==================================
 
-The age of the newest packet at the receiver, for the presets that are worth a method of passivity,
-and for one with a playout buffer, which makes a constant delay of a random one.
+Age of the newest packet at the receiver, for three presets of a network, and for one of them with a
+playout buffer, which makes a random delay constant.
 """
 
 from dataclasses import replace

@@ -1,9 +1,9 @@
 """
-An arm and a tool of your own
-=============================
+Your arm and tool
+=================
 
-The same hand with another arm (:download:`arm.urdf </gallery/arm.urdf>`) and another
-tool: a block of 1.8 kg. Both are identified before the run, as everything else.
+The same hand with another arm (:download:`arm.urdf </gallery/arm.urdf>`) and another tool, a block
+of 1.8 kg. Their load is identified before the run.
 """
 
 import matplotlib.pyplot as plt

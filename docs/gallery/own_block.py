@@ -1,9 +1,9 @@
 """
-A block of your own
-===================
+Your block as the master
+========================
 
-Any Drake system can take the place of the master. This one leads the slave along a circle. The
-wrist sensor reads what keeps 3.1 kg on it, about a point that is not zero: the sensor's offset.
+Any Drake system can replace the master. This one moves the slave along a circle. The wrist sensor
+measures the force that keeps 3.1 kg on the circle; the mean force is the sensor's offset.
 """
 
 import matplotlib.pyplot as plt
@@ -14,7 +14,7 @@ import drake_teleop as dt
 
 
 class CircleMaster(LeafSystem):
-    """Commands a circle of the slave, 40 mm wide, once a second."""
+    """Master that commands a circle of the slave, 40 mm wide, once per second."""
 
     def __init__(self, start):
         super().__init__()
@@ -29,7 +29,7 @@ class CircleMaster(LeafSystem):
 
 
 scenario = dt.LoadScenario("free_motion_force")
-scenario.force_scaling.sigma = 1.0  # all of the tool stays in, so that no load need be known
+scenario.force_scaling.sigma = 1.0  # the tool is displayed completely, so that no load is needed
 station = dt.MakeTeleopStation(scenario, master=CircleMaster(scenario.slave.position))
 result = dt.simulate(station, scenario.simulation, progress=False)
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 3.6))

@@ -3,7 +3,7 @@ Another haptic device
 =====================
 
 The same hand with four devices, by name. Each has the mass, friction, peak force and workspace of
-its data sheet: the swing differs, and where a top is flat the device is at its stop.
+its data sheet. Their swings differ; a flat top means that the device is at its stop.
 """
 
 import matplotlib.pyplot as plt

@@ -1,9 +1,9 @@
 """
-A plant of your own
-===================
+Your plant
+==========
 
 A plant (:download:`arm.urdf </gallery/arm.urdf>`) with Drake's controller, and the wrist sensor at
-the weld of a gripper of 1.3 kg. Nothing touches it: the sensor reads its weight and inertia, V φ.
+the weld of a gripper of 1.3 kg. Without contact, the sensor measures its weight and inertia, V φ.
 """
 
 import matplotlib.pyplot as plt

@@ -2,9 +2,9 @@
 Every passivity method over one network
 =======================================
 
-In one degree of freedom: the hand swings freely, presses a wall of 5.1 kN/m, holds and goes back,
-over a round trip of 100 ms with jitter and loss. Blue is the displayed force, grey what the wall
-gives.
+In one degree of freedom, the hand swings freely, presses on a wall of 5.1 kN/m, holds and retracts,
+over a round trip of 100 ms with jitter and loss. Blue: displayed force; grey: contact force times
+the force scale.
 """
 
 import matplotlib.pyplot as plt
@@ -19,8 +19,8 @@ figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=Tr
 for axes, method in zip(panels.flat, METHODS, strict=True):
     run = run_one_dof(REFERENCE, PassivityConfig(method=method), PRESETS["internet"])
     found = figures_of_run(run, REFERENCE)
-    axes.plot(run.t, REFERENCE.force_scale * run.wall, color=GREY, linewidth=0.8)
-    axes.plot(run.t, run.felt, color=BLUE, linewidth=0.8)
+    axes.plot(run.t, REFERENCE.force_scale * run.wall_force, color=GREY, linewidth=0.8)
+    axes.plot(run.t, run.hand_force, color=BLUE, linewidth=0.8)
     axes.set_title(f"{method}: {'stable' if found.stable else 'unstable'}")
     axes.set_ylim(-6, 3)
 figure.supxlabel("t [s]", fontsize="medium")

@@ -1,9 +1,9 @@
 """
-What a wrist sensor leaves, by its noise
-========================================
+Noise of wrist sensors
+======================
 
-The Allan deviation of the force of sensors as they are sold: how sure a mean over some time is.
-Where a curve turns up, averaging for longer makes it worse: take the offset (tare) anew by then.
+Allan deviation of the force of commercial sensors: the standard deviation of a mean over some time.
+Where a curve rises, a longer mean is less accurate: measure the offset again (tare) by then.
 """
 
 import matplotlib.pyplot as plt

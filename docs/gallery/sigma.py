@@ -2,8 +2,8 @@
 One contact, three shares of the tool
 =====================================
 
-Sigma is the share of the tool's weight and inertia that is left in the displayed force. With all
-of it (1) a touch is a notch in the swing, with none of it (0) it is all that there is.
+Sigma is the displayed share of the tool's weight and inertia. With sigma = 1 a contact is a small
+notch in the swing; with sigma = 0 only the contact is displayed.
 """
 
 import matplotlib.pyplot as plt

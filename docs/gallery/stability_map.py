@@ -1,9 +1,10 @@
 """
-Where is it stable?
-===================
+Map of stability
+================
 
 Round trip against the displayed share sigma of the tool, for a wall of 5.1 kN/m and the medium
-grip. Blue is the limit of stability. The colour is the error of the hand's force, 0.5 to 5 Hz.
+grip. The blue line is the limit of stability. The colour is the error of the displayed force, 0.5
+to 5 Hz.
 """
 
 from dataclasses import replace

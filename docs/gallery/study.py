@@ -2,8 +2,8 @@
 A study: many runs, one picture
 ===============================
 
-Two fields of a scenario, every combination, two seeds: what does each do to the force at the hand?
-The rows of a study go to disk as they come, so that it can be stopped and taken up again.
+Effects of two scenario fields on the force at the hand: every combination, with two seeds. A study
+writes its rows to disk as runs finish, so that it can be stopped and continued.
 """
 
 import tempfile

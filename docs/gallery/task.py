@@ -2,8 +2,8 @@
 A simulated operator notices contact
 ====================================
 
-The operator moves on until the displayed force indicates contact, with human delay and noise. The
-force before the contact is the tool's: with all of it (sigma = 1) contact is noticed later.
+The operator moves on until the displayed force indicates contact, with human delay and noise.
+Before contact the force is that of the tool: with sigma = 1 the operator notices contact later.
 """
 
 import matplotlib.pyplot as plt

@@ -1,9 +1,9 @@
 """
-Z-width: how stiff a wall can the device itself render?
-=======================================================
+Z-width: largest stiffness of a virtual wall
+============================================
 
-Virtual walls of a device at three rates: stable with a hand on it (full), and passive whatever
-holds it (dashed). Passive is sufficient, not necessary.
+Virtual walls of a device at three rates: stable with a hand on it (full), and passive for any hand
+(dashed). Passivity is sufficient for stability, not necessary.
 """
 
 import matplotlib.pyplot as plt

@@ -80,7 +80,7 @@ def to_float(name: str, value: Any) -> float:
 def check_nonzero_load(name: str, phi: Array) -> Array:
     if not phi.any():
         raise DrakeTeleopError(
-            "is zero, so this load is not identified",
+            "all ten parameters are zero: the load is not identified",
             where=name,
             remedy="identify it first: identify_load for a scenario, identify_log for a log",
         )

@@ -46,7 +46,7 @@ class Tolerance(NamedTuple):
 
     @property
     def required_entry_names(self) -> tuple[str, ...]:
-        """Names (k,) of the required numbers, such as "com x"."""
+        """Names (k,) of the numbers that have a tolerance, such as "com x"."""
         return tuple(
             entry for name in self.required_quantity_names for entry in NAMES_OF_ENTRIES[name]
         )
@@ -82,7 +82,7 @@ def parse_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of required numbers by [offsets; phi], divided by tolerances."""
+    """Return derivatives (k, 16) of the numbers in `tolerance` by [offsets; phi], over it."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -105,7 +105,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, divided by their tolerances."""
+    """Return the standard deviations (k,) of numbers with a tolerance, divided by it."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
@@ -114,14 +114,14 @@ def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
 
 
 def required_values(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
+    """Return the values (k,) of the numbers in `tolerance` for load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_units(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the tolerances (k,) of the required numbers for load phi (10,) [kg, mm, kg m^2]."""
+    """Return the absolute tolerances (k,) for a load phi (10,) [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantity_names]

@@ -61,7 +61,7 @@ def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate
     def estimate_at_delay(late: float | None) -> PoseEstimate:
         arrays = log.t, log.wrench, posed.poses, posed.gravity_W
         return estimate_from_poses(
-            *arrays, delay=late, gain=log.gain_std, lost=log.bridged, imu=posed.imu
+            *arrays, delay=late, gain_std=log.gain_std, lost=log.bridged, imu=posed.imu
         )
 
     return _fit_with_usual_delay_if_undetermined(log, delay, estimate_at_delay, 0.0, "undetermined")

@@ -62,7 +62,7 @@ def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> 
 def design_low_pass(dt, tangent, ahead_s, low_pass):
     """Write filter coefficients b (3), a (2) and settled state (2) to `low_pass` (7,), Eq. (T11).
 
-    `tangent` is tan(pi cutoff dt).
+    `tangent` is tan(pi cutoff dt), `ahead_s` [s] how far the output is extrapolated by its slope.
     """
     k = 2.0 / dt
     w = k * tangent / _FOURTH_ROOT_OF_3

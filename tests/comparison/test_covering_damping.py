@@ -29,8 +29,8 @@ def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2), intent=intent)
     periods = np.floor(6.0 * frequency)
     last = slice(len(t) - 1 - round(periods / frequency / PERIOD), len(t))
-    moved = np.diff(run.master[last])
-    return float(-np.sum(run.felt[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD)
+    moved = np.diff(run.master_position[last])
+    return float(-np.sum(run.hand_force[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD)
 
 
 @pytest.mark.slow

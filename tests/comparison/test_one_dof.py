@@ -63,9 +63,9 @@ def grows(model: OneDof, round_trip: int, rest: float) -> bool:
         NetworkConfig(delay=backward * PERIOD),
         intent=intent,
     )
-    if not np.isfinite(run.master).all():
+    if not np.isfinite(run.master_position).all():
         return True
-    swing = [np.ptp(run.master[start : start + 2000]) for start in (2000, 10000)]
+    swing = [np.ptp(run.master_position[start : start + 2000]) for start in (2000, 10000)]
     return bool(swing[1] > swing[0])
 
 
@@ -192,7 +192,8 @@ def test_simulation_and_linear_analysis_agree(model):
 def test_same_seed_gives_same_run():
     network = NetworkConfig(delay=0.05, jitter=0.5, loss=0.3)
     first, again, other = (
-        run_one_dof(OneDof(), PassivityConfig(), network, seed=seed).felt for seed in (1, 1, 2)
+        run_one_dof(OneDof(), PassivityConfig(), network, seed=seed).hand_force
+        for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0
@@ -211,13 +212,13 @@ def test_energy_balances_agree_with_spring_and_inertia():
     model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operator_intent(task), 10
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
-    spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
+    spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave_position, 0.0) ** 2
     hand, command, motor, actual = run.accounts.T
     # A spring returns its energy, to rounding: the wall is not active.
     np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
     assert spring.max() > 0.01 and run.least_energy_sum(ACTUAL) < -0.01 and run.start_energy == 0.0
     # Motor energy equals wall and kinetic energy; v is half a step of 50 us late.
-    speed = np.gradient(run.slave, PERIOD)
+    speed = np.gradient(run.slave_position, PERIOD)
     moving = 0.5 * scale * model.slave_mass * speed**2
     assert moving.max() > 0.1
     np.testing.assert_allclose(motor, actual - moving, rtol=0.0, atol=6e-4)
@@ -226,8 +227,8 @@ def test_energy_balances_agree_with_spring_and_inertia():
     np.testing.assert_array_equal(hand, run.channel_energy[:, 0])
     assert run.least_energy_sum(HAND) == hand.min()
     # The command's balance also contains the energy in the servo's lag.
-    wrench, lag = scale * run.wall, run.command - run.slave
-    sampled = np.cumsum(wrench * np.diff(run.slave, prepend=run.slave[0]))
+    wrench, lag = scale * run.wall_force, run.command_position - run.slave_position
+    sampled = np.cumsum(wrench * np.diff(run.slave_position, prepend=run.slave_position[0]))
     held = wrench * lag - np.cumsum(np.roll(lag, 1) * np.diff(wrench, prepend=0.0))
     np.testing.assert_allclose(command, sampled + held, rtol=0.0, atol=1e-12)
     assert (command - actual).max() > 1e-3
@@ -272,13 +273,16 @@ def test_changing_hand_wall_and_imperfections():
         timeout=0.05,
     )
     # The wall moves by 15 mm, pushes slave and free device away and returns; then packets stop.
-    assert run.wall[:599].min() == 0.0 == run.wall[750:].min() and run.wall[600:750].min() < -20.0
+    assert (
+        run.wall_force[:599].min() == 0.0 == run.wall_force[750:].min()
+        and run.wall_force[600:750].min() < -20.0
+    )
     assert run.accounts[749, ACTUAL] == run.accounts[-1, ACTUAL]
-    noise = run.felt[50:590] / model.force_scale
+    noise = run.hand_force[50:590] / model.force_scale
     assert noise.std() == pytest.approx(0.5, rel=0.15)
-    assert run.master[749] < 0.019 and np.all(run.time_without_packets[-1] > 0.09)
-    step_addresses = np.round(run.command[600:800] / 30e-6) * 30e-6
-    np.testing.assert_allclose(run.command[600:800], step_addresses, atol=1e-15)
+    assert run.master_position[749] < 0.019 and np.all(run.time_without_packets[-1] > 0.09)
+    step_addresses = np.round(run.command_position[600:800] / 30e-6) * 30e-6
+    np.testing.assert_allclose(run.command_position[600:800], step_addresses, atol=1e-15)
 
 
 def test_adversary_is_reproducible_and_finds_leaks_and_cycles(

@@ -40,10 +40,16 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"force_axes": FLIP, "torque_axes": FLIP}, ["axis y of the wrench is reversed"]),
         ({"torque_axes": SKEW}, ["the torque is turned by 30 deg about [0, 1, 0]"]),
         ({"force_axes": -SKEW}, ["the force is negated", "the force is turned by 30 deg"]),
-        ({"gain": np.array([1.05, 0.95])}, []),
-        ({"gain": np.array([0.1, 1.0])}, ["the force is 0.1 times that in N: its unit is daN"]),
-        ({"gain": np.array([1.0, 8.85])}, ["torque is 8.85 times that in N m: its unit is lbf in"]),
-        ({"gain": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
+        ({"force_torque_gains": np.array([1.05, 0.95])}, []),
+        (
+            {"force_torque_gains": np.array([0.1, 1.0])},
+            ["the force is 0.1 times that in N: its unit is daN"],
+        ),
+        (
+            {"force_torque_gains": np.array([1.0, 8.85])},
+            ["torque is 8.85 times that in N m: its unit is lbf in"],
+        ),
+        ({"force_torque_gains": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
         ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
     ],
 )  # fmt: skip
@@ -52,7 +58,7 @@ def test_findings_contain_figures_and_units(change, expected):
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message
-    if "1.3" in str(change.get("gain")):
+    if "1.3" in str(change.get("force_torque_gains")):
         assert "its unit" not in found[0].message
 
 
@@ -66,9 +72,9 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"force_axes": QUARTER, "torque_axes": QUARTER}, 1.5),
         ({"force_axes": SKEW, "torque_axes": SKEW}, 2.5),
         ({"torque_axes": FLIP}, 1.0),
-        ({"gain": np.array([2.0, 1.0])}, 1.0),
-        ({"gain": np.array([1.0, 3.0])}, 1.0),
-        ({"gain": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
+        ({"force_torque_gains": np.array([2.0, 1.0])}, 1.0),
+        ({"force_torque_gains": np.array([1.0, 3.0])}, 1.0),
+        ({"force_torque_gains": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
         ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
     ],
 )

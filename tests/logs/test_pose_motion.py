@@ -441,7 +441,7 @@ def test_planar_gravity_determines_the_unit_but_not_the_axes():
 
 
 def test_gain_errors_cause_a_misfit_unless_they_are_stated():
-    found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain=0.01)
+    found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain_std=0.01)
     assert not found.fit.is_rigid
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
@@ -453,9 +453,13 @@ def test_gain_errors_cause_a_misfit_unless_they_are_stated():
 @pytest.mark.slow
 def test_stated_gains_explain_only_their_share():
     kind = Kind(gain=0.01, seed=8)
-    assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.is_explained_by_gains
+    assert not estimate_from_poses(
+        *record(kind), GRAVITY_W, gain_std=0.001
+    ).fit.is_explained_by_gains
     turned = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
-    assert not estimate_from_poses(*record(turned), GRAVITY_W, gain=0.01).fit.is_explained_by_gains
+    assert not estimate_from_poses(
+        *record(turned), GRAVITY_W, gain_std=0.01
+    ).fit.is_explained_by_gains
 
 
 def test_gain_effects_predict_the_change_of_the_estimate():

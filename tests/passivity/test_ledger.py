@@ -108,7 +108,7 @@ def test_no_energy_is_created_at_the_actual_motion(seed):
         run = hard_taps(seed, passivity)
         assert run.start_energy == passivity.ledger.initial[0]
         assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
-        assert run.wall.min() < -50.0, "the wall should have been hit"
+        assert run.wall_force.min() < -50.0, "the wall should have been hit"
 
 
 @pytest.mark.parametrize(("step", "known"), [(5.5e-5, 5.5e-5), (2e-4, 2e-4), (2e-4, 5e-5)])
@@ -117,7 +117,7 @@ def test_no_energy_is_created_with_encoder_steps(step, known):
     ledger = LedgerConfig(encoder_step=[known, 0.0])
     run = hard_taps(1, PassivityConfig(method="ledger", ledger=ledger), master_resolution=step)
     assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
-    assert run.wall.min() < -50.0, "the wall should have been hit"
+    assert run.wall_force.min() < -50.0, "the wall should have been hit"
 
 
 @pytest.mark.parametrize("delay", [5e-4, 0.15])
@@ -125,7 +125,7 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
     """The fit of the bounces must not keep the motion alive."""
     axis = model(LIGHT, 50e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
-    assert run.wall[run.t < 4.0].min() < -50.0, "it should have hit the wall"
+    assert run.wall_force[run.t < 4.0].min() < -50.0, "it should have hit the wall"
     found = figures_of_run(run, axis)
     assert found.stable and abs(found.force_error) < 0.01
 
@@ -211,7 +211,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
         NetworkConfig(delay=0.063, jitter=0.44, loss=0.44, burst=0.26), seed=seed, timeout=0.1,
         intent=charging(t, 2.0, rng.uniform(0.03, 0.06)),
     )  # fmt: skip
-    assert run.time_without_packets.max() > 0.2 and run.wall.min() < -100.0
+    assert run.time_without_packets.max() > 0.2 and run.wall_force.min() < -100.0
     assert run.least_energy_sum(ACTUAL) >= -1e-6
 
 
@@ -241,7 +241,7 @@ def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     found = figures_of_run(run, axis, task)
     assert found.stable and abs(found.force_error) < 0.01
     assert abs(found.drift) < 1e-4 and found.chatter < 0.05 * found.felt_force
-    free = np.abs(run.felt[(run.t > 0.5) & (run.t < 3.5)])
+    free = np.abs(run.hand_force[(run.t > 0.5) & (run.t < 3.5)])
     assert 0.2 < free.max() <= 0.3, "drag should have been felt while it charged"
     if wall <= 5.1e3:
         softer = axis.force_scale * wall
@@ -280,7 +280,7 @@ def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
     )  # fmt: skip
     rest = run.t > 6.5
     assert 0.045 < run.time_without_packets[rest].max() < 0.05
-    assert np.ptp(run.slave[rest]) < 2e-5 and np.ptp(run.felt[rest]) < 0.01
+    assert np.ptp(run.slave_position[rest]) < 2e-5 and np.ptp(run.hand_force[rest]) < 0.01
 
 
 def test_motion_ends_after_a_change_of_grip():
@@ -293,9 +293,9 @@ def test_motion_ends_after_a_change_of_grip():
             intent=charging(t, 3.2, 0.02), grip=grip,
         )  # fmt: skip
         rest = t > 8.0
-        assert np.ptp(run.master[rest]) < 5e-5 and np.ptp(run.slave[rest]) < 5e-5
-        pressed = model().force_scale * run.wall[rest].mean()
-        assert run.felt[rest].mean() == pytest.approx(pressed, rel=0.01)
+        assert np.ptp(run.master_position[rest]) < 5e-5 and np.ptp(run.slave_position[rest]) < 5e-5
+        pressed = model().force_scale * run.wall_force[rest].mean()
+        assert run.hand_force[rest].mean() == pytest.approx(pressed, rel=0.01)
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.3])
@@ -308,9 +308,9 @@ def test_released_hand_is_not_accelerated(delay):
         intent=charging(t, 3.2, 0.0296), grip=grip,
     )  # fmt: skip
     start = np.searchsorted(t, 8.0)
-    assert abs(run.felt[start - 1]) == pytest.approx(4.0, rel=0.1)
-    assert np.abs(np.diff(run.master[start:])).max() < 0.3 * PERIOD
-    assert np.ptp(run.master[start:]) < 0.04
+    assert abs(run.hand_force[start - 1]) == pytest.approx(4.0, rel=0.1)
+    assert np.abs(np.diff(run.master_position[start:])).max() < 0.3 * PERIOD
+    assert np.ptp(run.master_position[start:]) < 0.04
 
 
 @pytest.mark.parametrize("wall", [5.1e3, 20e3])
@@ -323,7 +323,7 @@ def test_removed_wall_is_rendered_briefly(wall):
         model(), CHARGED_BEFORE, NetworkConfig(delay=0.05), timeout=PATIENT, intent=moving(x),
         wall=there,
     )  # fmt: skip
-    felt = np.abs(run.felt) > 0.05
+    felt = np.abs(run.hand_force) > 0.05
     assert np.count_nonzero(felt[(t > 2.0) & (t < 5.0)]) > 500
     assert 100 < np.count_nonzero(felt[t > 5.05]) < 200
 
@@ -344,7 +344,7 @@ def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
         model(grip), CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT,
         intent=charging(t, 3.0, 0.03), wall=there,
     )  # fmt: skip
-    felt = np.abs(run.felt)
+    felt = np.abs(run.hand_force)
     assert felt[(t > 5.8) & (t < 6.0)].min() > 1.0
     assert felt[t > 6.0 + delay + 0.02].max() < 0.05
     assert run.least_energy_sum(ACTUAL) >= -1e-6
@@ -363,7 +363,7 @@ def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
         model(grip), CHARGED_BEFORE, NetworkConfig(delay=5e-3), timeout=PATIENT,
         intent=charging(t, 3.0, 0.03), wall=there,
     )  # fmt: skip
-    felt = np.abs(run.felt)
+    felt = np.abs(run.hand_force)
     assert felt[(t > 5.8) & (t < 6.0)].min() > 1.0
     assert felt[t > 6.0065].max() < 0.3
     assert run.least_energy_sum(ACTUAL) >= -1e-6
@@ -379,8 +379,8 @@ def test_taps_are_rendered_from_the_second_on(rate):
         model(), CHARGED_BY_DRAG, NetworkConfig(delay=0.05), timeout=PATIENT, intent=moving(x)
     )
     later = t > 3.2 + 2.0 / rate
-    pressed = model().force_scale * run.wall[later].sum()
-    assert 0.75 < run.felt[later].sum() / pressed < 1.15
+    pressed = model().force_scale * run.wall_force[later].sum()
+    assert 0.75 < run.hand_force[later].sum() / pressed < 1.15
 
 
 @pytest.mark.parametrize(
@@ -396,7 +396,10 @@ def test_fast_hand_receives_the_contact_force(grip, wall, delay, end, share):
         intent=charging(times(end), 3.0, 0.03),
     )  # fmt: skip
     last = run.t > end - 0.3
-    felt, pressed = np.abs(run.felt[last]), axis.force_scale * np.abs(run.wall[last]).mean()
+    felt, pressed = (
+        np.abs(run.hand_force[last]),
+        axis.force_scale * np.abs(run.wall_force[last]).mean(),
+    )
     assert felt.mean() == pytest.approx(pressed, rel=0.02) and felt.std() < 0.05 * pressed
     softer = 1.0 / (1.0 / axis.servo_stiffness + 1.0 / wall) * axis.force_scale
     assert pressed > share * 0.03 * softer * grip[2] / (softer + grip[2])

@@ -296,8 +296,8 @@ def test_slave_follows_while_its_inertia_is_rendered(sigma):
     model = OneDof(sigma=sigma)
     network = NetworkConfig(delay=0.3, jitter=0.25, loss=0.1)
     run = run_one_dof(model, PassivityConfig(method="charged_tdpa"), network)
-    assert np.abs(run.slave[-1000:] - run.master[-1000:]).max() < 10e-3
-    assert run.wall.min() < -10.0, "the wall should have been pressed"
+    assert np.abs(run.slave_position[-1000:] - run.master_position[-1000:]).max() < 10e-3
+    assert run.wall_force.min() < -10.0, "the wall should have been pressed"
 
 
 @pytest.mark.parametrize(

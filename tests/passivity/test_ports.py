@@ -45,7 +45,7 @@ def pressed(method: str, seed: int, timeout: float) -> OneDofRun:
         NetworkConfig(delay=0.05, jitter=0.5, loss=0.4, burst=0.3),
         seed=seed, timeout=timeout, intent=np.stack([x, np.gradient(x, PERIOD)], axis=1),
     )  # fmt: skip
-    assert found.wall.min() < -10.0, "the wall should have been touched"
+    assert found.wall_force.min() < -10.0, "the wall should have been touched"
     return found
 
 
@@ -124,7 +124,7 @@ def test_tdpa_repays_the_energy_of_a_tap():
         REFERENCE, PassivityConfig(method="tdpa"), NetworkConfig(delay=0.05),
         intent=np.stack([x, np.gradient(x, PERIOD)], axis=1),
     )  # fmt: skip
-    assert found.wall.min() < -10.0, "the wall should have been touched"
+    assert found.wall_force.min() < -10.0, "the wall should have been touched"
     assert found.least_energy_sum(ACTUAL) > -0.06
 
 
@@ -171,8 +171,8 @@ def test_force_limit_bounds_the_rendered_force():
     """The bound is reached: the wall's force is twice as large."""
     found = pressed("force_limit", 2, 1.0)
     limit = ForceLimitConfig().force
-    assert MEDIUM.force_scale * np.abs(found.wall).max() > 2.0 * limit
-    assert np.abs(found.felt).max() == pytest.approx(limit, rel=1e-12)
+    assert MEDIUM.force_scale * np.abs(found.wall_force).max() > 2.0 * limit
+    assert np.abs(found.hand_force).max() == pytest.approx(limit, rel=1e-12)
     assert found.least_energy_sum(ACTUAL) < -0.01
 
 
@@ -187,5 +187,5 @@ def test_four_channels_are_transparent_without_delay():
     )  # fmt: skip
     assert abs(figures_of_run(found, MEDIUM, task).force_error) < 0.02
     held = slice(3500, 3900)
-    assert found.wall[held].mean() / MEDIUM.servo_stiffness < -2e-4
-    np.testing.assert_allclose(found.slave[held], found.master[held], atol=1e-6)
+    assert found.wall_force[held].mean() / MEDIUM.servo_stiffness < -2e-4
+    np.testing.assert_allclose(found.slave_position[held], found.master_position[held], atol=1e-6)

@@ -26,7 +26,7 @@ def test_released_hand_stays_slow(method, delay):
         REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=delay), intent=intent,
         grip=grip, timeout=1.0,
     )  # fmt: skip
-    speed = np.abs(np.diff(run.master[LET_GO - 1 :])) / PERIOD
+    speed = np.abs(np.diff(run.master_position[LET_GO - 1 :])) / PERIOD
     assert speed.max() < 0.3
 
 

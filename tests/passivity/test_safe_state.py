@@ -54,7 +54,7 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     """The wall is held from 6.5 to 11.5 s; nothing arrives from 8 to 9 s."""
     model = OneDof(wall_stiffness=1000.0)
     result = run(silent(tmp_path, [(8.0, 9.0)]), method, model)
-    t, felt, command = result.t, result.felt, result.command
+    t, felt, command = result.t, result.hand_force, result.command_position
     assert np.abs(felt[(t > 7.5) & (t < 8.0)]).min() > 0.3
     entered = 8.0 + 0.01 + TIMEOUT
     assert np.abs(felt[(t > entered + STOP_TIME_S + 0.01) & (t < 9.0)]).max() < 1e-12
@@ -93,8 +93,8 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
             intent=intent,
         )
         second = (result.t > task.end + 9.5) & (result.t < task.end + 11.4)
-        felt.append(result.felt[second].mean())
-        wall.append(result.wall[second].mean())
+        felt.append(result.hand_force[second].mean())
+        wall.append(result.wall_force[second].mean())
     assert felt[0] == pytest.approx(felt[1], rel=0.02)
     assert wall[0] == pytest.approx(wall[1], rel=0.02)
 
@@ -106,13 +106,13 @@ def test_motion_during_silence_is_not_replayed(tmp_path, method):
     t = result.t
     # Never faster than the hand itself and the way that was missed, on the ramp of the resumption,
     # whose steepest rate is 15/8.
-    missed = np.ptp(result.master)
-    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME_TIME_S * PERIOD
+    missed = np.ptp(result.master_position)
+    fast = np.abs(np.diff(result.master_position)).max() + 15 / 8 * missed / RESUME_TIME_S * PERIOD
     back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME_S))[:-1]
-    assert np.abs(np.diff(result.slave))[back].max() < fast
+    assert np.abs(np.diff(result.slave_position))[back].max() < fast
     if not METHODS[method].balance_at_motors:  # there the command is a pull, written as a pose
-        assert np.abs(np.diff(result.command))[back].max() < fast
-    assert np.abs(np.diff(result.command)).max() < 5e-3
+        assert np.abs(np.diff(result.command_position))[back].max() < fast
+    assert np.abs(np.diff(result.command_position)).max() < 5e-3
 
 
 def rough(path: Path, rng: np.random.Generator, until: float = 9.0) -> NetworkConfig:
@@ -155,12 +155,12 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method, force_limit=5.0)
         result = run_one_dof(model, config, forward, backward, timeout=TIMEOUT)
-        assert np.isfinite(result.felt).all() and np.isfinite(result.command).all()
-        assert np.abs(result.felt).max() <= 5.0 + 1e-12
+        assert np.isfinite(result.hand_force).all() and np.isfinite(result.command_position).all()
+        assert np.abs(result.hand_force).max() <= 5.0 + 1e-12
         found = figures_of_run(result, model)
         assert found.stable, found
         assert abs(found.drift) < 2e-3, found
-        assert np.abs(result.felt[-1000:]).max() < 0.1
+        assert np.abs(result.hand_force[-1000:]).max() < 0.1
 
 
 @pytest.mark.long
@@ -176,7 +176,7 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
         since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
         resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
-        growth = np.diff(np.abs(result.felt), prepend=0.0)[resuming]
+        growth = np.diff(np.abs(result.hand_force), prepend=0.0)[resuming]
         assert growth.max(initial=0.0) < 1.001 * PEAK_FORCE_N * PERIOD / RESUME_TIME_S
     assert resumptions >= 5
 

@@ -58,11 +58,11 @@ def test_lag_is_lookahead_plus_dead_time_plus_half_a_period(arm):
 
 
 def test_step_response_equals_closed_form_after_dead_time(arm):
-    """Solution of d2r/dt2 = gain (1 - r - lookahead dr/dt), damping ratio 0.87."""
+    """Solution of d2r/dt2 = k (1 - r - lookahead dr/dt), damping ratio 0.87."""
     states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)
     response = (states[:, 0] - HOME[0]) / 0.02
     assert np.abs(response[: round(UR.dead_time / PERIOD)]).max() < 1e-9
-    w = np.sqrt(UR.gain)
+    w = np.sqrt(UR.acceleration_per_error)
     damping = 0.5 * w * UR.lookahead
     turning = w * np.sqrt(1 - damping**2)
     t = (np.arange(800) + 1) * PERIOD - UR.dead_time
@@ -115,7 +115,7 @@ def test_torque_with_invalid_command_or_encoders(arm, bad):
     ("changes", "where"),
     [
         ({"command_hz": 300.0}, "command_hz"),
-        ({"gain": 1e7, "lookahead": 0.1}, "gain"),
+        ({"acceleration_per_error": 1e7, "lookahead": 0.1}, "acceleration_per_error"),
         ({"drive_bandwidth_hz": 500.0}, "drive_bandwidth_hz"),
     ],
 )

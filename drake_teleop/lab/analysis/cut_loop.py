@@ -47,19 +47,23 @@ class CutLoop:
 
     @classmethod
     def from_multipliers(
-        cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
+        cls,
+        open_multipliers: Complex,
+        closed_multipliers: Complex,
+        period_s: ArrayLike,
+        level: ArrayLike = 1.0,
     ) -> CutLoop:
-        """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
-        shape, n = opened.shape[:-1], opened.shape[-1]
+        """Return the loop with these multipliers (..., n) and the crossings of |L| = `level`."""
+        shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _write_gain_crossings(
-            opened.reshape(-1, n),
-            closed.reshape(-1, n),
+            open_multipliers.reshape(-1, n),
+            closed_multipliers.reshape(-1, n),
             np.full(shape, level).ravel(),
             _SEARCH_ANGLES_RAD,
             found.reshape(3, -1, _MAX_GAIN_CROSSINGS),
         )
-        return cls(opened, closed, np.broadcast_to(period, shape), *found)
+        return cls(open_multipliers, closed_multipliers, np.broadcast_to(period_s, shape), *found)
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:

@@ -84,13 +84,16 @@ def _decay_and_frequency(multiplier: complex, period: float) -> dict[str, Any]:
     }
 
 
-def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the Diagram's largest relative deviations from one-axis hybrid matrices to 30 Hz."""
+def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """Return the largest relative deviations to 30 Hz of a two-port from the one-axis models.
+
+    `H` (N, 2, 2) is the linearised Diagram's hybrid matrix at `OMEGA`, with the hand's mass.
+    """
     compared = OMEGA <= COMPARISON_BAND_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def greatest_deviations(other: Complex) -> dict[str, float]:
-        found = np.abs(with_hand[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
+        found = np.abs(H[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     return {

@@ -127,7 +127,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """Return the method's initial energy plus that (N,) put in by hand and environment [J]."""
+    """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         accounts += load_work(result, scenario)

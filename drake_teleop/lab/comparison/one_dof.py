@@ -108,11 +108,11 @@ class OneDofRun:
     """
 
     t: NDArray[np.float64]  #: s
-    master: NDArray[np.float64]  #: m
-    slave: NDArray[np.float64]  #: m
-    command: NDArray[np.float64]  #: m, received by the slave
-    felt: NDArray[np.float64]  #: N, on the hand
-    wall: NDArray[np.float64]  #: N, on the slave
+    master_position: NDArray[np.float64]  #: m
+    slave_position: NDArray[np.float64]  #: m
+    command_position: NDArray[np.float64]  #: m, received by the slave
+    hand_force: NDArray[np.float64]  #: N, on the hand
+    wall_force: NDArray[np.float64]  #: N, on the slave
     channel_energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
     time_without_packets: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
     accounts: NDArray[np.float64]  #: (N, 4) J
@@ -241,10 +241,10 @@ def _smooth_ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray
 def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
     return figures_of_traces(
         t=run.t,
-        master=run.master,
-        slave=run.slave,
-        felt=run.felt,
-        pressed=model.force_scale * model.gamma * run.wall,
+        master=run.master_position,
+        slave=run.slave_position,
+        felt=run.hand_force,
+        pressed=model.force_scale * model.gamma * run.wall_force,
         energy=run.channel_energy.sum(axis=1),
         task=task,
     )

@@ -60,11 +60,11 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
     grip[release_row:] = 0.0
     released = simulate_hand(pressing, grip)
-    after = released.master[release_row:]
+    after = released.master_position[release_row:]
     tapping = [simulate_hand(_intended_tap_motion(rate, round_trip)) for rate in TAP_RATES_HZ]
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
-        release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),
+        release_force=float(np.abs(released.hand_force[release_row - 100 : release_row]).mean()),
         release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
@@ -83,8 +83,8 @@ def _intended_tap_motion(rate: float, round_trip: float) -> NDArray[np.float64]:
 
 
 def _displayed_impulse_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
-    first = int(np.argmax(run.wall < 0.0))
+    first = int(np.argmax(run.wall_force < 0.0))
     second = first + round(0.75 / rate / PERIOD)  # between first and second contact
-    pressed = scale * run.wall[second:].sum()
-    felt = run.felt[second + round(way / PERIOD) :].sum()
+    pressed = scale * run.wall_force[second:].sum()
+    felt = run.hand_force[second + round(way / PERIOD) :].sum()
     return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0

@@ -66,7 +66,7 @@ _MAX_ERROR_OVER_DISPLACEMENT = 0.1  # error of an arm with few joints, over disp
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
-MIN_HELD_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
+MIN_LOAD_SHARE_HELD_BY_MOTORS = 0.05  #: Share of the load that weak motors must hold at rest.
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_JOINT_MOVE_TO_CORNER = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
@@ -195,7 +195,7 @@ def find_start_place(
 def _find_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
     roomy = joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
-    for share in (1.0, MIN_HELD_LOAD_SHARE):
+    for share in (1.0, MIN_LOAD_SHARE_HELD_BY_MOTORS):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
         strong = (np.abs(torques) < MAX_HOLDING_TORQUE_USE * arm.effort_limit).all(axis=1)

@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
     MAX_HOLDING_TORQUE_USE,
-    MIN_HELD_LOAD_SHARE,
+    MIN_LOAD_SHARE_HELD_BY_MOTORS,
     OPPOSITE_AXIS,
     TOOL_AXES,
     StartPlace,
@@ -110,7 +110,7 @@ def plan_station(
     plane = base_plane(shapes)
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
-    share = 1.0 if own_tool else MIN_HELD_LOAD_SHARE if tool is None else 0.0
+    share = 1.0 if own_tool else MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_torque_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _largest_mass_to_hold(model, place.q)

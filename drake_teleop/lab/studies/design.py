@@ -169,15 +169,18 @@ class Study:
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
         """Raise above `MAX_RUNS` runs, or above `MAX_RUNS_WITHOUT_CONSENT` unless `yes`."""
         runs = self.num_points() * self.repeats
-        what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
+        count = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
-            what = f"{what} are too many (at most {MAX_RUNS:,})"
-            raise DrakeTeleopError(what, where=where, remedy="give fewer values or repeats")
+            raise DrakeTeleopError(
+                f"{count} are too many (at most {MAX_RUNS:,})",
+                where=where,
+                remedy="give fewer values or repeats",
+            )
         if runs <= MAX_RUNS_WITHOUT_CONSENT or yes is True:
             return
-        if yes is False or not yes(f"{where}: {what}. Begin?"):
+        if yes is False or not yes(f"{where}: {count}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
-            raise DrakeTeleopError(f"{what} need your consent", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"{count} need your consent", where=where, remedy=remedy)
 
     def points(self) -> list[FactorValues]:
         """Return all points (field -> value); of an adaptive design, the first ones."""

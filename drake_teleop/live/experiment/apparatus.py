@@ -39,7 +39,7 @@ def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition; `load_mass_at_hand`: fully rendered load [kg]."""
+    """Station of a task and condition; `load_mass_at_hand`: perceived mass at load scale 1 [kg]."""
 
     task: Task
     condition: Condition

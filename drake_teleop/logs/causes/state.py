@@ -208,7 +208,7 @@ class State:
         if self.data.gravity_W is not None:
             parts.append(y[:, ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, R_P_PRODUCTS] @ _cable_stiffness_signals().T)
+            parts.append(y[:, R_P_PRODUCTS] @ _cable_stiffness_selector().T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_predecessors, self.noise_filters
@@ -286,7 +286,8 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _cable_stiffness_signals() -> Array:
+def _cable_stiffness_selector() -> Array:
+    """Return the matrix (18, 27) from `R_P_PRODUCTS` to the signals of a symmetric stiffness."""
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):

@@ -1,4 +1,4 @@
-"""Corrections of a log description with which a load explains the wrench, Eqs. (1)-(2), (5)."""
+"""Corrections of signs, axes, units and clocks of log descriptions that let a load fit, Eq. (5)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class LoadFit:
     Attributes:
         unexplained, noise_share: shares of the wrench's variance: unexplained, white noise.
         mass: fitted mass [kg].
-        independent: number of independent samples.
+        independent_samples: number of samples with independent noise.
     """
 
     unexplained: float

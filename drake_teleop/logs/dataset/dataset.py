@@ -336,7 +336,7 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     usual = shared.usual_half_widths
     spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0] - np.log(usual)
-    spread -= np.log(found.gain).repeat(3)
+    spread -= np.log(found.force_torque_gains).repeat(3)
     if not faults and spread.mean() > _MAX_UNEXPLAINED_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))

@@ -49,7 +49,7 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     )
     if not np.allclose(x.force_axes, x.torque_axes):
         found += _rotation_faults(x.torque_axes, "the torque")
-    found += _unit_faults(x.gain)
+    found += _unit_faults(x.force_torque_gains)
     late = x.lag - usual_lag
     if abs(late) >= _MIN_UNUSUAL_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"

@@ -50,7 +50,7 @@ class Hypothesis:
         kind: one of `HYPOTHESIS_KINDS`.
         lag: delay of the motion behind the wrench [frames].
         force_axes, torque_axes: (3, 3) rotation or mirroring of the load's force and torque.
-        gain: (2,) factors of force and torque.
+        force_torque_gains: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
         spread: (6,) logarithms of the half widths of the residual.
         offsets: (6,) sensor offsets [N, N m].
@@ -61,7 +61,7 @@ class Hypothesis:
     lag: float
     force_axes: Array
     torque_axes: Array
-    gain: Array
+    force_torque_gains: Array
     phi: Array | None = None
     spread: Array = field(default_factory=lambda: np.zeros(6))
     offsets: Array = field(default_factory=lambda: np.zeros(6))
@@ -71,13 +71,16 @@ class Hypothesis:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
         return np.hstack(
-            [self.gain[0] * f @ self.force_axes.T, self.gain[1] * tau @ self.torque_axes.T]
+            [
+                self.force_torque_gains[0] * f @ self.force_axes.T,
+                self.force_torque_gains[1] * tau @ self.torque_axes.T,
+            ]
         )
 
     def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
         f, tau = wrench[:, :3] @ self.force_axes, wrench[:, 3:] @ self.torque_axes
-        return np.hstack([f / self.gain[0], tau / self.gain[1]])
+        return np.hstack([f / self.force_torque_gains[0], tau / self.force_torque_gains[1]])
 
 
 def hypothesis_without_fault(lag: float) -> Hypothesis:
@@ -160,7 +163,9 @@ class HypothesisSearch:
         for det in (1.0, -1.0):
             start = self.refit_to_best_rows(plain, det=det, scale=True)
             yield start
-            yield self.refit_to_best_rows(replace(start, gain=one), det=det, scale=False)
+            yield self.refit_to_best_rows(
+                replace(start, force_torque_gains=one), det=det, scale=False
+            )
             nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force_axes).sum()))
             for M in (np.eye(3), -np.eye(3), nearest):
                 yield self.refit_to_best_rows(
@@ -205,12 +210,12 @@ class HypothesisSearch:
                     np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
                     for c in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
                 ]
-                x = replace(x, gain=np.maximum(ratio, 1e-9))
+                x = replace(x, force_torque_gains=np.maximum(ratio, 1e-9))
             if det:
-                M = _fit_rotation(w, q, x.gain, det)
+                M = _fit_rotation(w, q, x.force_torque_gains, det)
                 x = replace(x, force_axes=M, torque_axes=M)
             if scale:
-                x = replace(x, gain=_fit_gains(w, q, x))
+                x = replace(x, force_torque_gains=_fit_gains(w, q, x))
             x = self.with_spread_and_cost(x)
             rows = self._best_rows_of(x)
         return x
@@ -293,7 +298,7 @@ def _weighted_number_of_faults(x: Hypothesis, usual_lag: float) -> float:
     if x.phi is not None:
         return count + 4.0
     count += _rotation_cost(x.force_axes) + float(not np.allclose(x.force_axes, x.torque_axes))
-    scaled = x.gain != 1.0
+    scaled = x.force_torque_gains != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 
 

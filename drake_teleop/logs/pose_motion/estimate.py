@@ -148,7 +148,7 @@ def estimate_from_poses(
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
     R_SP: ArrayLike | None = _IDENTITY_ROTATION,
     delay: float | None = None,
-    gain: float = 0.0,
+    gain_std: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
     imu: ImuData | None = None,
 ) -> PoseEstimate:
@@ -156,8 +156,8 @@ def estimate_from_poses(
 
     The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Origin
     `p_SoPo_S` [m], rotation `R_SP`, and delay of the poses behind the wrench [s] are estimated
-    where None. `gain` is the standard deviation of the sensor gains. Samples with `lost` True are
-    excluded. IMU data of S are used if they fit the wrench better.
+    where None. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
+    are excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
         found, _, window = _find_splines_and_delay(
@@ -176,7 +176,7 @@ def estimate_from_poses(
         best = fit_linear_model(Z, levels)
 
         def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
-            return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
+            return fit_rigid(Z, Q, levels, start, free, best, gain_std=gain_std)
 
         seen = estimate_units_and_axes(best)
         start = _initial_rigid_parameters(p_SoPo_S, R_SP, seen)

@@ -1,4 +1,4 @@
-"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76)."""
+"""Linear model of the wrench in 16 signals (1, a, -g, alpha, products of omega), (T73)-(T76)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 DELAY_SEARCH_HALF_RANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
 MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-7
-"""Least noise of a channel relative to the wrench."""
+"""Least noise of a channel relative to the wrench, for rounded numbers."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
 _REWEIGHTING_ITERATIONS = 4
 _MIN_POSES_PER_S = 125.0
@@ -85,7 +85,7 @@ def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
 def _fit_to_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    floor = _rounding_error_of_wrench_powers(ff, levels.band_sizes)
+    floor = _min_noise_power_of_wrench(ff, levels.band_sizes)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -129,19 +129,19 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
     return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
-def rounding_error_power(Z: Array, sizes: Array) -> Array:
-    """Return the power (6,) of rounding errors in the wrench channels."""
-    return _rounding_error_of_wrench_powers(_moments_of_signals_and_wrench(Z)[2], sizes)
+def min_noise_power(Z: Array, band_sizes: Array) -> Array:
+    """Return the least noise power (6,) of the wrench, by rounding; Z: `Spectra.second_moments`."""
+    return _min_noise_power_of_wrench(_moments_of_signals_and_wrench(Z)[2], band_sizes)
 
 
-def _rounding_error_of_wrench_powers(ff: Array, sizes: Array) -> Array:
-    power = ff.sum(axis=0) / sizes.sum()
+def _min_noise_power_of_wrench(ff: Array, band_sizes: Array) -> Array:
+    power = ff.sum(axis=0) / band_sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
+    """Return noise levels, with the best of white noise and random walks (T74) in each channel."""
     levels = NoiseLevels.white_within_groups(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_COST_REDUCTION_BY_DRIFT
     shape = levels.relative_power.copy()

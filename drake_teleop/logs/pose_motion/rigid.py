@@ -13,7 +13,7 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
 from drake_teleop.load.identification import mark_undetermined
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
-from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
+from drake_teleop.logs.pose_motion.linear_model import LinearFit, min_noise_power
 from drake_teleop.logs.pose_motion.spectra import (
     NUM_MOMENT_SIGNALS,
     SIGNAL_RATE_COLUMNS,
@@ -143,7 +143,7 @@ def fit_rigid(
     free: NDArray[np.bool_],
     linear: LinearFit,
     *,
-    gain: float = 0.0,
+    gain_std: float = 0.0,
 ) -> RigidFit:
     """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
 
@@ -154,7 +154,7 @@ def fit_rigid(
     solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.parameters)
-    least = rounding_error_power(record.moments, levels.band_sizes)
+    least = min_noise_power(record.moments, levels.band_sizes)
     power = np.maximum(
         levels.noise_power(_residual_channel_powers(record, plain.parameters)), least
     )
@@ -163,12 +163,12 @@ def fit_rigid(
         covariance=np.zeros((0, 0)),
         misfit=2.0 * (float(levels.negative_log_likelihoods(power).sum()) - linear.cost),
         degrees_of_freedom=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
-        expected_misfit_by_gains=_expected_misfit_by_gains(record, plain, gain),
+        expected_misfit_by_gains=_expected_misfit_by_gains(record, plain, gain_std),
     )
     if not fit.is_rigid:
         solution = _solve_rigid_fit(record, solution.parameters, one_weight=True)
         fit = replace(fit, parameters=solution.parameters)
-    covariance = _parameter_covariance(record, solution, fit.std_inflation_by_misfit, gain)
+    covariance = _parameter_covariance(record, solution, fit.std_inflation_by_misfit, gain_std)
     return replace(fit, covariance=covariance)
 
 
@@ -215,7 +215,7 @@ def _solve_rigid_fit(
 
 
 def _parameter_covariance(
-    record: _FitData, solution: _RigidSolution, inflation: float, gain: float
+    record: _FitData, solution: _RigidSolution, inflation: float, gain_std: float
 ) -> Array:
     inverse, undetermined = solution.inverse_gram, solution.is_undetermined
     W, none = solution.residual_weights, np.zeros((6, NUM_MOMENT_SIGNALS))
@@ -224,9 +224,9 @@ def _parameter_covariance(
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_std_factors_of_estimated_weights(record, solution)])
     larger = covariance * inflation**2
-    if gain:
+    if gain_std:
         clean = record.moments - record.noise_moments
-        effects = gain * _parameter_errors_of_unit_gains(solution, clean)
+        effects = gain_std * _parameter_errors_of_unit_gains(solution, clean)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -313,7 +313,7 @@ def _residual_covariances(
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
         _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(sums, used),
-        rounding_error_power(record.moments, levels.band_sizes),
+        min_noise_power(record.moments, levels.band_sizes),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
@@ -332,8 +332,8 @@ def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array
     return parameter_errors_by_gains(BF, solution.residual_weights, solution.inverse_gram)
 
 
-def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
-    if gain == 0.0:
+def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain_std: float) -> float:
+    if gain_std == 0.0:
         return 0.0
     B, levels = solution.residual_derivative, record.noise_levels
     effects = _parameter_errors_of_unit_gains(solution, record.moments)
@@ -343,7 +343,7 @@ def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain: 
     for c in range(6):
         left[c, c, :, WRENCH_COLUMNS] += np.diag(length[c] / length)
     left = left.reshape(6, 36, NUM_MOMENT_SIGNALS)
-    sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.moments, left, optimize=True)
+    sums = gain_std**2 * np.einsum("cik,bkm,cim->bc", left, record.moments, left, optimize=True)
     more = levels.noise_power(np.maximum(sums, 0.0)) / record.linear_noise_power
     return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 

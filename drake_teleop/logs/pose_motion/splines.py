@@ -31,9 +31,10 @@ _MAX_PENALTY_OVER_POSE_WEIGHT = 1e12
 
 @dataclass(frozen=True, eq=False)
 class ImuSplineRows:
-    """IMU data at times t (K,) [s], corrected to axes, clock and zero bias of poses.
+    """IMU data at times t (K,) [s], in the axes and clock of the poses, without bias.
 
     Attributes:
+        rate: mean rate of the data [Hz].
         acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
         quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
         pose_noise_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].

@@ -62,7 +62,8 @@ class LoadEstimatorConfig:
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
-                f"the covariance of method '{self.method}' is too small to detect a change of load",
+                f"'{self.method}' ignores the noise of the motion, so its covariance is too"
+                " small to detect a change of load",
                 where=f"{where}.method",
                 remedy="set method: rtls, or watch: false",
             )

@@ -110,18 +110,20 @@ def step_display(wrench, device, parameters, period, J, drive):
 @njit(cache=True)
 def _fade_wrench_after_fault(device, parameters, period, drive):
     displayed, last = drive[DISPLAYED_WRENCH_SLOTS], device[DISPLAYED_WRENCH_SLOTS]
-    limits, full = np.empty(2), _peak_wrench_of_device(parameters)
+    limits, device_limits = np.empty(2), _peak_wrench_of_device(parameters)
     fault = drive[_FAULT_SLOT] != _NO_FAULT
     drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
     # Complete within STOP_TIME_S, so that the direction does not jump either.
     share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_FAULT_AGE_SLOT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_MONITOR_SLOTS], limits)
+    master_limits_into(
+        not fault, fault, period, 0.0, device_limits, last, drive[_MONITOR_SLOTS], limits
+    )
     drive[_IS_WRENCH_REDUCED_SLOT] = 0.0
     for g in range(2):
         limit_group(displayed, g, limits[g])
-        if limits[g] < full[g]:
+        if limits[g] < device_limits[g]:
             drive[_IS_WRENCH_REDUCED_SLOT] = 1.0
     if not fault:
         drive[_FAULT_SLOT] = _RESUMING_FAULT

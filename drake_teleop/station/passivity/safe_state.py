@@ -46,16 +46,20 @@ _COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
 _LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
 
-def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+def initial_master_monitor(
+    device_limits: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
 
-    With the device's limits `full` (2,) [N, N m], return that of normal operation instead.
+    With `device_limits` (2,), the device's largest force and torque [N, N m], return that of normal
+    operation instead.
     """
     watch = np.zeros(MASTER_MONITOR_SIZE)
-    if full is None:
+    if device_limits is None:
         watch[SILENCE_TIME] = np.inf
     else:
-        watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
+        watch[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
+        watch[_CONNECTED_TIME] = RESUME_TIME_S
     return watch
 
 
@@ -77,24 +81,23 @@ def _update_silence_time(alive, fault, T, watch):
 
 
 @njit(cache=True)
-def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
+def master_limits_into(alive, fault, T, timeout, device_limits, displayed, watch, limits):
     """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
 
     `alive` means that a new packet of a healthy slave came; `fault` that data of the hand or the
-    slave are not finite. `timeout` [s] is the time without packets until the end is silent, `full`
-    (2,) the device's limits, `held` (6,) the displayed wrench. `watch` is the silence monitor,
-    updated.
+    slave are not finite. `timeout` [s] is the time without packets until the end is silent,
+    `displayed` (6,) the displayed wrench. `watch` is the silence monitor, updated.
     """
     _update_silence_time(alive, fault, T, watch)
     connected = watch[SILENCE_TIME] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
     present, fall = watch[_PRESENT_HAND_WRENCH_LIMITS], watch[_WRENCH_LIMIT_FALL_RATE]
     for g in range(2):
-        size, limit = length_of_group(held, g), present[g]
+        size, limit = length_of_group(displayed, g), present[g]
         if connected:
             fall[g] = 0.0
             start = size if watch[_CONNECTED_TIME] < RESUME_TIME_S else limit
-            limit = min(full[g], start + full[g] * T / RESUME_TIME_S)
+            limit = min(device_limits[g], start + device_limits[g] * T / RESUME_TIME_S)
         else:
             if fall[g] == 0.0:
                 limit = min(limit, size)

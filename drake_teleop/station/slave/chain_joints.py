@@ -42,11 +42,13 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
         child = joint.child_body()
         if child.index() in parents or child.index() == world:
             other = parents.get(child.index())
-            on = joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
+            parents_text = (
+                joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
+            )
             raise DrakeTeleopError(
-                f"link {child.name()} is the child of {on}",
+                f"link {child.name()} is the child of {parents_text}",
                 where=where,
-                remedy="an arm is a tree: each link is the child of one joint, the world of none",
+                remedy="an arm is a tree: make each link the child of one joint, the world of none",
             )
         parents[child.index()] = joint
     for start in parents:

@@ -2,7 +2,7 @@
 
 command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
 
-d2r/dt2 = gain (target - (r + lookahead dr/dt))
+d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
 d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
 
 import math
@@ -35,7 +35,9 @@ class PositionInterface:
     dead_time: float = quantity(
         0.004, "s", 0.0, 1.0, "dead time of a command; whole periods of command_hz"
     )
-    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per position error")
+    acceleration_per_error: float = quantity(
+        300.0, "1/s^2", 1.0, 1e7, "acceleration per position error"
+    )
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
     max_speed: float = quantity(
         math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
@@ -57,12 +59,13 @@ class PositionInterface:
                 where=f"{where}.command_hz",
                 remedy="choose a rate of the joint control that is a multiple of it",
             )
-        damping = self.gain * self.lookahead / rate
-        if damping + 0.5 * self.gain / rate**2 > 1.5:  # unstable from 2
+        damping = self.acceleration_per_error * self.lookahead / rate
+        if damping + 0.5 * self.acceleration_per_error / rate**2 > 1.5:  # unstable from 2
             raise DrakeTeleopError(
-                f"a gain of {self.gain:g} 1/s^2 is too high for control steps of {1e3 / rate:g} ms",
-                where=f"{where}.gain",
-                remedy="lower gain or lookahead, or raise rates.joint_control_hz",
+                f"{self.acceleration_per_error:g} 1/s^2 is too high for control steps of"
+                f" {1e3 / rate:g} ms",
+                where=f"{where}.acceleration_per_error",
+                remedy="lower it or lookahead, or raise rates.joint_control_hz",
             )
         if self.drive_bandwidth_hz > 0.1 * rate:
             raise DrakeTeleopError(
@@ -79,7 +82,7 @@ POSITION_INTERFACES: dict[str, PositionInterface] = {
     "franka_position": PositionInterface(
         command_hz=1000.0,
         dead_time=0.002,
-        gain=(200 * math.pi) ** 2,
+        acceleration_per_error=(200 * math.pi) ** 2,
         lookahead=1 / (100 * math.pi),
         max_speed=2.175,
         max_acceleration=7.5,
@@ -93,8 +96,8 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     """Accept the command (n,) [rad] if one is due, and advance the reference by one period.
 
     Args:
-        interface: (6,) period [s], gain [1/s^2], lookahead [s], drive bandwidth [rad/s], periods
-            per command, length of the command queue.
+        interface: (6,) period [s], acceleration per error [1/s^2], lookahead [s], drive bandwidth
+            [rad/s], periods per command, length of the command queue.
         limits: (2, n) speed and acceleration limits.
         memory: memory of `PositionServo`, see `_PERIODS_SINCE_COMMAND_INDEX`; updated.
         reference: (3, n) output: reference position, velocity, acceleration.
@@ -172,7 +175,7 @@ class PositionServo(LeafSystem):
         queued = round(interface.dead_time * interface.command_hz)
         numbers = [
             period,
-            interface.gain,
+            interface.acceleration_per_error,
             interface.lookahead,
             2 * np.pi * interface.drive_bandwidth_hz,
             round(1 / (interface.command_hz * period)),
