@@ -148,7 +148,7 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
 
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFit:
         # A wrong description may cause a wrong delay.
-        log = data.read_thinned_log(edited)
+        log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
         fits = [fit_load(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -214,6 +214,26 @@ def _is_delay_significant(log: Log, delay: float | None) -> bool:
     none, aligned = fit_load(log), fit_load(remove_delay(log, delay))
     gain = none.independent_samples * np.log(none.unexplained / (aligned.unexplained + 1e-30))
     return bool(gain > 25.0)
+
+
+def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log | None:
+    a, b = old.wrench, new.wrench
+    if a is None or b is None or "base" in (a.frame, b.frame):
+        return None
+    changes = {"sign": a.sign, "frame": a.frame, "force": a.force, "torque": a.torque}
+    if new.model_copy(update={"wrench": b.model_copy(update=changes)}) != old:
+        return None
+    R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
+    parts = []
+    for x, force, new_columns in (
+        (log.wrench[:, :3], a.force.columns, b.force.columns),
+        (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
+    ):
+        if set(force) != set(new_columns) or len(force) != 3:
+            return None
+        given = x @ R_old  # in the axes of the file
+        parts.append(given[:, [force.index(column) for column in new_columns]] @ R_new.T)
+    return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
 def _findings_without_remedy(
