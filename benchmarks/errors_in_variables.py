@@ -26,7 +26,7 @@ from instrumental import RecursiveInstrumentalVariables
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import PARAMETER_NAMES
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor

@@ -36,7 +36,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
-from drake_teleop.load.normal_equations import NormalEquations, identify
+from drake_teleop.load.normal_equations import SecondMoments, identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import (
@@ -325,7 +325,7 @@ def consistent_load() -> dict[str, float]:
     _, s, omega, alpha = samples(60, seed=3)
     rng = np.random.default_rng(3)
     wrench = non_contact_wrench(s, omega, alpha, rod) + 3 * NOISE * rng.normal(size=(60, 6))
-    equations = NormalEquations(NOISE)
+    equations = SecondMoments(NOISE)
     equations.add_samples(wrench, s, omega, alpha)
     gram, right = (part / 60 for part in equations.normal_equations())
     theta = np.linalg.solve(gram, right)

@@ -28,7 +28,7 @@ import numpy as np
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.change import (
     OFFSET_DRIFT_STD,
     STATE_NAMES,

@@ -23,7 +23,7 @@ import numpy as np
 
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.regressor import non_contact_wrench
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "utias_workshop_tools"

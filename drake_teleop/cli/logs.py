@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
-from drake_teleop.common.files import output_folder, write_json, write_picture, write_table
+from drake_teleop.common.files import (
+    output_folder,
+    to_json_data,
+    write_json,
+    write_picture,
+    write_table,
+)
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import Identification, load_of_object
@@ -24,7 +30,6 @@ from drake_teleop.logs.figures import (
     summarize_object_alone,
     summarize_record_part,
     summarize_wrenches,
-    to_plain_values,
 )
 from drake_teleop.logs.processing import (
     DetectedLog,
@@ -72,7 +77,7 @@ def identify_command(
     if alone is not None:
         summary |= {"gripper": str(gripper), "object": summarize_object_alone(alone)}
         summary["notes"] += notes_on_object_alone(alone)
-    summary = to_plain_values(summary)
+    summary = to_json_data(summary)
     from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
     from drake_teleop.logs.report import write_report
 
@@ -147,7 +152,7 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
-    summary = to_plain_values(
+    summary = to_json_data(
         summary | summarize_wrenches(found) | summarize_detected_contact(found, causal_tare_s)
     )
     from drake_teleop.logs.pictures import draw_elimination
@@ -205,7 +210,7 @@ def detect_command(
         "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes
-    summary = to_plain_values(summary)
+    summary = to_json_data(summary)
     from drake_teleop.logs.pictures import draw_detection
 
     with output_folder(out):

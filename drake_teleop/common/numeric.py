@@ -110,6 +110,16 @@ def positive_array(name: str, value: ArrayLike, *shape: int) -> Array:
     return array
 
 
+def nonnegative_array(name: str, value: ArrayLike, *shape: int) -> Array:
+    """Return an array as `finite_array`; raise DrakeTeleopError if a value is negative."""
+    array = finite_array(name, value, *shape)
+    if (array < 0.0).any():
+        raise DrakeTeleopError(
+            f"has the negative value {array.min():g}", where=name, remedy="give values of 0 or more"
+        )
+    return array
+
+
 def one_blas_thread() -> AbstractContextManager[object]:
     """Limit BLAS to one thread in a context; several threads change the last digits of sums."""
     import scipy.linalg  # noqa: F401 (a BLAS that is loaded later is not limited)

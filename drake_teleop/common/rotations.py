@@ -91,6 +91,11 @@ def signed_permutations() -> list[Array]:
     ]
 
 
+def axis_names(P: Array) -> list[str]:
+    """Return the names of the rows of a signed permutation P (3, 3), such as ["-y", "x", "z"]."""
+    return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in P]
+
+
 def right_angled_rotations() -> list[Array]:
     """Return the 24 rotations (3, 3) that map axes to axes, identity first."""
     return [R for R in signed_permutations() if np.linalg.det(R) > 0]

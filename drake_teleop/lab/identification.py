@@ -23,7 +23,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import NoiseFloor, limit_covariance
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.result import SimulationResult

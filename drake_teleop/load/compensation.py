@@ -176,19 +176,13 @@ def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
     """Return sigma_gripper, sigma_object, gamma for the share eta of the object, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
-        raise DrakeTeleopError(
-            f"{eta:g} is outside 0 to 1",
-            where="eta",
-            remedy="give the share of the object that stays",
-        )
+        what = f"{eta:g} is outside 0 to 1"
+        raise DrakeTeleopError(what, where="eta", remedy="give the share of the object that stays")
     return 0.0, float(eta), 1.0
 
 
 def _check_scale(name: str, value: float) -> float:
     if not 0.0 <= to_float(name, value) < np.inf:
-        raise DrakeTeleopError(
-            f"{value} is not a finite number >= 0",
-            where=name,
-            remedy="give a scale, such as 0 or 1",
-        )
+        what = f"{value} is not a finite number >= 0"
+        raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
     return float(value)

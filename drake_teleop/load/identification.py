@@ -102,12 +102,13 @@ class Identification:
         "prior": the value is mostly that of the prior.
         """
         share = self.standard_deviations / natural_scales(self.phi)
-        rest = np.where(
-            self.prior_dominated,
-            "prior",
-            np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not"),
-        )
+        weakly = np.where(share <= _MAX_WEAKLY_IDENTIFIED_STD_SHARE, "weakly", "not")
+        rest = np.where(self.prior_dominated, "prior", weakly)
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
+
+    def with_unidentified_load(self) -> Identification:
+        """Return the result with all ten parameters of the load marked as not identified."""
+        return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PARAMETER)
 
     def __repr__(self) -> str:
         deviations = self.standard_deviations
@@ -136,28 +137,11 @@ class Identification:
         """Write identification.json; raise DrakeTeleopError if a number is not finite."""
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
-        covariance = self.covariance.tolist()
-        for i in np.flatnonzero(np.isinf(np.diag(self.covariance))):
-            covariance[i][i] = None
-        document = {
-            "phi": self.phi.tolist(),
-            "offsets": self.offsets.tolist(),
-            "covariance": covariance,
-            "identifiable": self.identifiable.tolist(),
-            "verdicts": list(self.verdicts),
-            **self._derived_quantities(),
-            "condition_number": self.condition_number,
-            "delay_s": self.delay_s,
-            "residual_rms": self.residual_rms.tolist(),
-            "method": self.method,
-            "samples": self.samples,
-            "weight_removed": self.weight_removed,
-            "degrees_of_freedom": [
-                float(n) if np.isfinite(n) else None for n in self.degrees_of_freedom
-            ],
-            "prior_dominated": self.prior_dominated.tolist(),
-        }
-        write_json(Path(path), document)
+        fields = list(self.__dataclass_fields__)
+        document = {name: getattr(self, name) for name in (*fields[:4], "verdicts")}
+        document |= self._derived_quantities()
+        document |= {name: getattr(self, name) for name in fields[4:]}
+        write_json(Path(path), document)  # infinity becomes null
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
@@ -220,13 +204,8 @@ class Identification:
         return result
 
     def _derived_quantities(self) -> dict[str, Any]:
-        mass, com, inertia = mass_com_inertia(self.phi)
-        return {
-            "mass": mass,
-            "com": com.tolist(),
-            "inertia_com": inertia.tolist(),
-            "physically_consistent": self.physically_consistent,
-        }
+        names = ("mass", "com", "inertia_com", "physically_consistent")
+        return {name: getattr(self, name) for name in names}
 
 
 def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:
@@ -249,6 +228,13 @@ def com_standard_deviations(phi: Array, covariance: Array) -> Array:
 
 def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
     return standard_deviations <= MAX_IDENTIFIED_STD_SHARE * natural_scales(phi)
+
+
+def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+    """Return the covariance (n, n) with variance inf, and no correlation, of flagged parameters."""
+    out = np.where(undetermined[:, None] | undetermined, 0.0, covariance)
+    out[undetermined, undetermined] = np.inf
+    return out
 
 
 def natural_scales(phi: Array) -> Array:
@@ -336,15 +322,12 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     covariance = total.covariance.copy()
     covariance[6:, 6:] += gripper.covariance[6:, 6:]
     undetermined = np.isinf(np.diag(covariance))
-    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-    covariance[undetermined, undetermined] = np.inf
+    covariance = mark_undetermined(covariance, undetermined)
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT_STDS_BELOW_ZERO * deviations[6] or phi[0] == 0.0:
-        raise DrakeTeleopError(
-            f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)",
-            where="gripper",
-            remedy="give the gripper alone as gripper, and the record with the object as the load",
-        )
+        what = f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)"
+        remedy = "give the gripper alone as gripper, and the record with the object as the load"
+        raise DrakeTeleopError(what, where="gripper", remedy=remedy)
     identifiable = is_precise_enough(deviations, phi) & ~undetermined
     identifiable[6:] &= total.identifiable[6:]
     return replace(

@@ -27,11 +27,9 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
     p = finite_array("p_SoBcm_S", p_SoBcm_S, 3)
     I = finite_array("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
     if np.abs(I - I.T).max() > 1e-9 * np.abs(I).max():
-        raise DrakeTeleopError(
-            "the inertia tensor is not symmetric",
-            where="I_BBcm_S",
-            remedy="give equal products of inertia above and below the diagonal",
-        )
+        what = "the inertia tensor is not symmetric"
+        remedy = "give equal products of inertia above and below the diagonal"
+        raise DrakeTeleopError(what, where="I_BBcm_S", remedy=remedy)
     about_origin = I + _inertia_of_point_mass(p, m)
     return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
 
@@ -41,11 +39,8 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     phi = finite_array("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError(
-            "the mass is 0, so the centre of mass is undefined",
-            where="phi",
-            remedy="give a mass phi[0] other than 0",
-        )
+        what = "the mass is 0, so the centre of mass is undefined"
+        raise DrakeTeleopError(what, where="phi", remedy="give a mass phi[0] other than 0")
     p = phi[1:4] / m
     return m, p, inertia_about_origin(phi) - _inertia_of_point_mass(p, m)
 
@@ -99,11 +94,8 @@ def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Arr
     """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2)."""
     R = finite_array("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-        raise DrakeTeleopError(
-            "is not a rotation matrix",
-            where="R_AB",
-            remedy="give an orthonormal, right-handed matrix",
-        )
+        remedy = "give an orthonormal, right-handed matrix"
+        raise DrakeTeleopError("is not a rotation matrix", where="R_AB", remedy=remedy)
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = finite_array("p_AoBo_A", p_AoBo_A, 3)

@@ -75,11 +75,8 @@ def parse_tolerance(text: str) -> Tolerance:
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
         if not _MIN_TOLERANCE <= value <= _MAX_TOLERANCE:
-            raise DrakeTeleopError(
-                f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)",
-                where=text,
-                remedy="correct the number or its unit",
-            )
+            what = f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)"
+            raise DrakeTeleopError(what, where=text, remedy="correct the number or its unit")
         found[name] = value
     return Tolerance(**found)
 

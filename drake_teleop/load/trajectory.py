@@ -76,49 +76,38 @@ class FourierTrajectory:
     def load(cls, path: str | Path) -> FourierTrajectory:
         from drake_teleop.common.texts import read_yaml
 
-        data = read_yaml(path)
+        data, where = read_yaml(path), str(path)
+        remedy = "give each joint one q0, and one rho and delta per harmonic"
         try:
             joints = list(data["joints"].values())
-            for fields, known in [
-                (data, _FILE_FIELDS),
-                *((joint, _FIELDS_PER_JOINT) for joint in joints),
-            ]:
+            parts = [(data, _FILE_FIELDS), *((joint, _FIELDS_PER_JOINT) for joint in joints)]
+            for fields, known in parts:
                 if unknown := sorted(fields.keys() - known):
-                    raise DrakeTeleopError(
-                        f"there is no field '{unknown[0]}'",
-                        where=str(path),
-                        remedy=f"the fields are {', '.join(sorted(known))}",
-                    )
+                    what = f"there is no field '{unknown[0]}'"
+                    names = ", ".join(sorted(known))
+                    raise DrakeTeleopError(what, where=where, remedy=f"the fields are {names}")
             q0, rho, delta = (
                 np.array([joint[name] for joint in joints], dtype=float)
                 for name in ("q0", "rho", "delta")
             )
             frequency = float(data["frequency"])
         except KeyError as error:
-            raise DrakeTeleopError(
-                f"{error} is missing", where=str(path), remedy="give q0, rho, delta and frequency"
-            ) from None
+            what, remedy = f"{error} is missing", "give q0, rho, delta and frequency"
+            raise DrakeTeleopError(what, where=where, remedy=remedy) from None
         except DrakeTeleopError:
             raise
         except (AttributeError, TypeError, ValueError) as error:
-            raise DrakeTeleopError(
-                f"is not a trajectory ({error})",
-                where=str(path),
-                remedy="give each joint one q0, and one rho and delta per harmonic",
-            ) from None
+            what = f"is not a trajectory ({error})"
+            raise DrakeTeleopError(what, where=where, remedy=remedy) from None
         shapes_fit = q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
         if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):
-            raise DrakeTeleopError(
-                "is not a trajectory: q0, rho and delta differ in shape, a number is not finite, or"
-                " the frequency is not above 0",
-                where=str(path),
-                remedy="give each joint one q0, and one rho and delta per harmonic",
-            )
+            what = "is not a trajectory: q0, rho and delta differ in shape, a number is not finite,"
+            what += " or the frequency is not above 0"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         if np.abs(numbers).max() > _MAX_NUMBER:
-            raise DrakeTeleopError(
-                f"contains numbers above {_MAX_NUMBER:g}", where=str(path), remedy="give rad and Hz"
-            )
+            what = f"contains numbers above {_MAX_NUMBER:g}"
+            raise DrakeTeleopError(what, where=where, remedy="give rad and Hz")
         return cls(q0, rho, delta, frequency)
 
 

@@ -40,11 +40,9 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
-            raise DrakeTeleopError(
-                "causal mode `predicted` needs a low-pass below half the rate of the log",
-                where="cutoff",
-                remedy="give a lower cut-off, or causal mode `delayed`",
-            )
+            what = "causal mode `predicted` needs a low-pass below half the rate of the log"
+            remedy = "give a lower cut-off, or causal mode `delayed`"
+            raise DrakeTeleopError(what, where="cutoff", remedy=remedy)
         return x
     from scipy.signal import lfilter
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
+from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
-from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
+from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.causes.explain import Explanation, explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
@@ -25,26 +25,20 @@ from drake_teleop.logs.pose_motion.splines import PoseSplines, noise_share_passe
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.table_files import TABLE_READERS
+from drake_teleop.logs.read.table_files import yaml_only_note
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
 _MAX_PLAUSIBLE_MASS_KG = 1000.0
-_SIGN_FIELD = "wrench.sign"
-_FRAME_FIELD = "wrench.frame"
-_WEIGHT_FIELD = "wrench.weight"
-_GRAVITY_FIELD = "gravity"
-_FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD = "wrench.force.scale", "wrench.torque.scale"
-_FORCE_UNIT_FIELD, _TORQUE_UNIT_FIELD = "wrench.force.unit", "wrench.torque.unit"
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
 _FORCE_UNITS = ("N", "kgf", "lbf")
 _TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
 _UNIT_RATIO_TOLERANCE = 1e-3
 _POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
 _ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
-_DECIMALS_OF_FIELD = {_GRAVITY_FIELD: 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
+_DECIMALS_OF_FIELD = {"gravity": 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
 _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
@@ -66,14 +60,14 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
-    ratio = fields[_TORQUE_SCALE_FIELD] / fields[_FORCE_SCALE_FIELD]
-    text = _yaml_value(_TORQUE_SCALE_FIELD, ratio)
+    ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
+    text = _yaml_value("wrench.torque.scale", ratio)
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
-        f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
+        f" {log.described.wrench.force.unit}; set wrench.force.scale to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{yaml_only_note(log)}"
+        f" and wrench.torque.scale to {text} times that{yaml_only_note(log.source)}"
     )
 
 
@@ -82,7 +76,7 @@ def _correct_fields(
 ) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
     assert log.described is not None
     fields = _correctable_fields(log.described, by_pose)
-    column = _column_of_each_axis(fields[_FRAME_FIELD])
+    column = _column_of_each_axis(fields["wrench.frame"])
     touched: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
@@ -98,12 +92,8 @@ def _correct_fields(
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{yaml_only_note(log)}" if lines else otherwise)
+        texts.append(f"set {lines}{yaml_only_note(log.source)}" if lines else otherwise)
     return fields, texts, corrected
-
-
-def yaml_only_note(log: Log) -> str:
-    return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
 def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -112,14 +102,14 @@ def _correctable_fields(description: Description, by_pose: bool) -> DescriptionF
     frame: Any = np.eye(3) if wrench.frame == "sensor" else wrench.frame
     weight: Any = (0.0, 0.0, 0.0, 0.0) if wrench.weight is None else wrench.weight
     out: DescriptionFields = {
-        _SIGN_FIELD: wrench.sign,
-        _FRAME_FIELD: frame if isinstance(frame, str) else np.array(frame),
-        _FORCE_SCALE_FIELD: np.array(wrench.force.scale),
-        _TORQUE_SCALE_FIELD: np.array(wrench.torque.scale),
-        _FORCE_UNIT_FIELD: wrench.force.unit,
-        _TORQUE_UNIT_FIELD: wrench.torque.unit,
-        _WEIGHT_FIELD: weight if isinstance(weight, str) else np.array(weight),
-        _GRAVITY_FIELD: description.gravity_W,
+        "wrench.sign": wrench.sign,
+        "wrench.frame": frame if isinstance(frame, str) else np.array(frame),
+        "wrench.force.scale": np.array(wrench.force.scale),
+        "wrench.torque.scale": np.array(wrench.torque.scale),
+        "wrench.force.unit": wrench.force.unit,
+        "wrench.torque.unit": wrench.torque.unit,
+        "wrench.weight": weight if isinstance(weight, str) else np.array(weight),
+        "gravity": description.gravity_W,
     }
     if imu is not None and imu.specific_force is not None and not by_pose:
         out["imu.position"] = np.array(imu.position)
@@ -144,9 +134,9 @@ def _column_of_each_axis(frame: Any) -> list[int] | None:
 def _yaml_value(name: str, value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
-    if name in (_FRAME_FIELD, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
+    if name in ("wrench.frame", "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
         return "sensor"
-    if name in (_FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD):
+    if name in ("wrench.force.scale", "wrench.torque.scale"):
         factors = [f"{x:.6g}" for x in value]
         return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
     exact = np.round(value, _DECIMALS_OF_FIELD.get(name, 6)) + 0.0
@@ -156,12 +146,12 @@ def _yaml_value(name: str, value: Any) -> str:
 def _correct_axes(fields: DescriptionFields, values: dict[str, Any]) -> None:
     Q = np.array(values["matrix"])
     sign = 1 if np.linalg.det(Q) > 0.0 else -1
-    base = isinstance(fields[_FRAME_FIELD], str)
+    base = isinstance(fields["wrench.frame"], str)
     if base and not (sign * np.eye(3) == Q).all():
         return
-    fields[_SIGN_FIELD] = sign * fields[_SIGN_FIELD]
+    fields["wrench.sign"] = sign * fields["wrench.sign"]
     if not base:
-        fields[_FRAME_FIELD] = sign * Q.T @ fields[_FRAME_FIELD]
+        fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
 
 
 def _correct_sensor_rotation(fields: DescriptionFields, values: dict[str, Any]) -> None:
@@ -172,23 +162,25 @@ def _correct_sensor_rotation(fields: DescriptionFields, values: dict[str, Any]) 
 
 def _correct_gravity(fields: DescriptionFields, values: dict[str, Any]) -> None:
     true = np.array(values["gravity"])
-    fields[_GRAVITY_FIELD] = true * np.linalg.norm(fields[_GRAVITY_FIELD]) / np.linalg.norm(true)
+    fields["gravity"] = true * np.linalg.norm(fields["gravity"]) / np.linalg.norm(true)
 
 
 def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    fields[_WEIGHT_FIELD] = "removed"
+    fields["wrench.weight"] = "removed"
 
 
 def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    force = SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]]
-    torque = SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]]
-    ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
-    ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
+    force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
+    torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
+    ratios = [
+        (torque / SI_VALUE_OF_UNIT[unit], "wrench.torque.unit", unit) for unit in _TORQUE_UNITS
+    ]
+    ratios += [(SI_VALUE_OF_UNIT[unit] / force, "wrench.force.unit", unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
             fields[name] = unit
             return
-    fields[_TORQUE_SCALE_FIELD] = fields[_TORQUE_SCALE_FIELD] / values["factor"]
+    fields["wrench.torque.scale"] = fields["wrench.torque.scale"] / values["factor"]
 
 
 def _correct_gain(
@@ -197,10 +189,9 @@ def _correct_gain(
     if column is None:
         return
     c = CHANNEL_NAMES.index(values["channel"])
-    scale = fields[_FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD] = fields[
-        _FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD
-    ].copy()
-    scale[column[c % 3]] /= values["gain"]
+    name = "wrench.force.scale" if c < 3 else "wrench.torque.scale"
+    fields[name] = fields[name].copy()
+    fields[name][column[c % 3]] /= values["gain"]
 
 
 def _correct_pose_frame(fields: DescriptionFields, values: dict[str, Any]) -> None:
@@ -316,7 +307,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         offsets=why.theta[:6],
         covariance=why.covariance,
         identifiable=identifiable,
-        residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
+        residual_rms=why.state.rows.residual_rms(why.state.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
         or "weight" in why.always_fitted,
         prior_dominated=np.zeros(16, bool),

@@ -116,17 +116,13 @@ def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
         return np.abs(x).max(axis=0)
 
     inner, weightless = ~found.edge, found.gravity_only
-    return (
-        _summarize_force_and_torque("raw", "rms", found.measured[inner], rms_over_samples)
-        | _summarize_force_and_torque(
-            "gravity_only",
-            "rms",
-            None if weightless is None else weightless[inner],
-            rms_over_samples,
-        )
-        | _summarize_force_and_torque("residual", "rms", found.contact[inner], rms_over_samples)
-        | _summarize_force_and_torque("residual", "peak", found.contact[inner], peak_over_samples)
-    )
+    weightless = None if weightless is None else weightless[inner]
+    figures = _summarize_force_and_torque("raw", "rms", found.measured[inner], rms_over_samples)
+    figures |= _summarize_force_and_torque("gravity_only", "rms", weightless, rms_over_samples)
+    for suffix, reduce in (("rms", rms_over_samples), ("peak", peak_over_samples)):
+        contact = found.contact[inner]
+        figures |= _summarize_force_and_torque("residual", suffix, contact, reduce)
+    return figures
 
 
 def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
@@ -168,12 +164,11 @@ def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dic
         "gravity_only": found.gravity_only,
         "eliminated": found.contact,
     }
-    return {
-        name: None
-        if wrench is None
-        else (np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean()
-        for name, wrench in wrenches.items()
-    }
+
+    def share_above(wrench: Array) -> float:
+        return float((np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean())
+
+    return {name: None if w is None else share_above(w) for name, w in wrenches.items()}
 
 
 def _summarize_force_and_torque(
@@ -184,14 +179,3 @@ def _summarize_force_and_torque(
         return dict.fromkeys(keys)
     norms = [reduce(np.linalg.norm(part, axis=1)) for part in (wrench[:, :3], wrench[:, 3:])]
     return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
-
-
-def to_plain_values(value: Any) -> Any:
-    """Convert NumPy values to plain Python values, and infinity to None."""
-    if isinstance(value, dict):
-        return {key: to_plain_values(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_plain_values(entry) for entry in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return to_plain_values(value.tolist())
-    return None if value in (float("inf"), float("-inf")) else value

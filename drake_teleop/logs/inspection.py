@@ -88,11 +88,9 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         }
         return Draft(*draft_of_bag(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
-        raise DrakeTeleopError(
-            "a log description names all files of a recording, so that no others can be added",
-            where=str(path),
-            remedy="inspect it alone, or give only tables and bags",
-        )
+        what = "a log description names all files of a recording, so that no others can be added"
+        remedy = "inspect it alone, or give only tables and bags"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     summary["kind"] = "unknown"
     table = read_table(path)
     header = not _are_column_names_numbers(list(table.columns))
@@ -299,9 +297,8 @@ def _inspect_clock(
         )
         findings.append(Finding("gap", text))
     if back:
-        row = table.line_in_file(
-            np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1]
-        )
+        finite = np.flatnonzero(np.isfinite(stamps))
+        row = table.line_in_file(finite[int(np.argmax(steps <= 0)) + 1])
         text = (
             f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
             " rows with equal stamps are omitted or spread evenly; a log with decreasing"

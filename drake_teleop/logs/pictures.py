@@ -39,13 +39,8 @@ _PARAMETER_SYMBOLS = (
     *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
 VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
-VERDICT_WORDS = dict(
-    zip(
-        VERDICT_NAMES,
-        ("identified", "weakly identified", "not identified", "mostly the prior's"),
-        strict=True,
-    )
-)
+_VERDICT_TEXTS = ("identified", "weakly identified", "not identified", "mostly the prior's")
+VERDICT_WORDS = dict(zip(VERDICT_NAMES, _VERDICT_TEXTS, strict=True))
 _MAX_CURVE_POINTS, _MAX_WELCH_WINDOW_SAMPLES = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED_COLOUR = "#A3AAB5"
@@ -88,13 +83,8 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
         spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
         left, right = spectra.subplots(1, 2)
         for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-            curves = zip(
-                _CHANNEL_SYMBOLS[columns],
-                (BLUE, VERMILION, GREEN),
-                shown[:, columns].T,
-                strict=True,
-            )
-            for name, colour, values in curves:
+            symbols, colours = _CHANNEL_SYMBOLS[columns], (BLUE, VERMILION, GREEN)
+            for name, colour, values in zip(symbols, colours, shown[:, columns].T, strict=True):
                 if log.static:
                     axis.plot(rate, values, "o", color=colour, label=name)
                 else:
@@ -189,10 +179,8 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         _draw_curves(magnitude, t, norms, static)
         magnitude.set_ylim(bottom=0)
         torques = [(n, np.linalg.norm(w[:, 3:], axis=1), c) for n, w, c in curves]
-        magnitude.set_title(
-            f"$|F|$, rms in N: {_rms_text(norms)}\n$|\\tau|$, rms in N m: {_rms_text(torques)}",
-            fontsize=8.5,
-        )
+        title = f"$|F|$, rms in N: {_rms_text(norms)}\n$|\\tau|$, rms in N m: {_rms_text(torques)}"
+        magnitude.set_title(title, fontsize=8.5)
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, touched)
         axes = _channel_axes(below)
@@ -228,9 +216,8 @@ def draw_detection(found: DetectedLog) -> Any:
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set_ylabel(f"{found.statistic} [standard deviations]")
         below.set_xlabel("time [s]")
-        below.set_title(
-            f"above the threshold {100 * found.is_above_threshold.mean():.2g} % of the time"
-        )
+        share = 100 * found.is_above_threshold.mean()
+        below.set_title(f"above the threshold {share:.2g} % of the time")
         for axis in (top, below):
             shade_contact(axis, t, found.touched[inner])
         figure.legend(loc="outside lower center", ncols=3)

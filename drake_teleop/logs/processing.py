@@ -26,7 +26,11 @@ from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_in
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import read_aligned_log
+from drake_teleop.logs.aligned_log import (
+    METHODS_WITH_SPLINES,
+    fit_load_to_posed_log,
+    read_aligned_log,
+)
 from drake_teleop.logs.causal import CausalWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
@@ -54,7 +58,6 @@ from drake_teleop.logs.explained_log import (
     replace_frame_causes,
     unexplained_finding,
 )
-from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_load_to_posed_log
 from drake_teleop.logs.read.alignment import (
     choose_delay,
     far_from_gaps,
@@ -211,16 +214,11 @@ def _read_and_identify_log(
     else:
         log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
     motion = None if posed is None else posed.motion
-    why = (
-        explain_log(raw, delay_s, motion)
-        if _is_explanation_possible(raw, posed is not None)
-        else None
-    )
-    if (
-        why is not None
-        and raw.gain_std > 0.0
-        and {x.name for x in why.causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
-    ):
+    why = None
+    if _is_explanation_possible(raw, posed is not None):
+        why = explain_log(raw, delay_s, motion)
+    names = {x.name for x in why.causes} if why is not None else set()
+    if why is not None and raw.gain_std > 0.0 and names <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS:
         why = replace(why, causes=(), explained=True, loads=())
     is_delay_disturbed = why is not None and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S
     if why is not None and why.causes and source == "estimated" and is_delay_disturbed:
@@ -235,9 +233,7 @@ def _read_and_identify_log(
     if not errors and why is not None and why.causes and why.is_misfit:
         errors = motion_findings(check)
     if errors:
-        why = None
-        known = result.identifiable & np.repeat([True, False], [6, 10])
-        result = replace(result, identifiable=known)
+        why, result = None, result.with_unidentified_load()
     if why is not None:
         result = explained_load(result, why)
         causes = replace_frame_causes(why, other[0]) if other else why.causes
@@ -247,7 +243,7 @@ def _read_and_identify_log(
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
+    findings = _findings_of_causes(causes)
     if errors:
         findings = errors
     elif not causes and not raw.estimated:
@@ -258,21 +254,10 @@ def _read_and_identify_log(
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
-        result = replace(
-            result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
-        )
-    base = base_parameters(fit.equations)
-    loads = () if why is None else why.loads
+        result = result.with_unidentified_load()
     return IdentifiedLog(
-        log,
-        result,
-        predicted,
-        source,
-        fit.rejected,
-        base,
-        findings,
-        causes,
-        loads,
+        *(log, result, predicted, source, fit.rejected, base_parameters(fit.equations)),
+        *(findings, causes, () if why is None else why.loads),
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
 
@@ -293,6 +278,10 @@ def _fit_load_to_motion(
         gain_std=log.gain_std,
     )
     return log, fit, delay_s, source
+
+
+def _findings_of_causes(causes: tuple[Cause, ...]) -> tuple[Finding, ...]:
+    return tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
 
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
@@ -317,12 +306,8 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
-        causes = tuple(
-            Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
-        )
-        return replace(
-            checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
-        )
+        delay = own_delay if np.isfinite(deviation) else delay
+        return replace(checks, findings=_findings_of_causes(identified.causes), delay_s=delay)
     if all(finding.name == "lag" for finding in findings):
         findings = (*findings, *identified.findings)
     description = identified.log.described
@@ -409,11 +394,8 @@ def eliminate_log(
         tare=tare,
     )
     if untouched_s is not None and not tare:
-        raise DrakeTeleopError(
-            "a span without contact determines the offsets, but those of the load are requested",
-            where="untouched",
-            remedy="leave one of the two out",
-        )
+        what = "a span without contact determines the offsets, but those of the load are requested"
+        raise DrakeTeleopError(what, where="untouched", remedy="leave one of the two out")
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
@@ -436,11 +418,8 @@ def eliminate_log(
 
 
 def _static_log_error(log: Log) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        "contains only poses at rest (`static`), in which no contact can be detected",
-        where=log.source,
-        remedy="give a log of a motion",
-    )
+    what = "contains only poses at rest (`static`), in which no contact can be detected"
+    return DrakeTeleopError(what, where=log.source, remedy="give a log of a motion")
 
 
 def _read_and_eliminate_log(
@@ -457,22 +436,14 @@ def _read_and_eliminate_log(
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
-        raise DrakeTeleopError(
-            "a contact-free start requires `causal`, the mode of wrenches as in a control loop",
-            where="causal_tare_s",
-            remedy="give causal as well, or remove it",
-        )
-    phi, _ = usable_phi(identification)
+        what = "a contact-free start requires `causal`, the mode of wrenches as in a control loop"
+        remedy = "give causal as well, or remove it"
+        raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
+    phi = usable_phi(identification)[0]
     phi_object = phi - phi_gripper
-    aligned = read_aligned_log(
-        path,
-        phi,
-        identification.delay_s,
-        cutoff_hz,
-        delay,
-        causal is not None,
-        identification.weight_removed,
-    )
+    known_load = phi, identification.delay_s
+    removed = identification.weight_removed
+    aligned = read_aligned_log(path, *known_load, cutoff_hz, delay, causal is not None, removed)
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.delay_source
     if log.static and causal is not None:
         raise DrakeTeleopError(
@@ -484,20 +455,18 @@ def _read_and_eliminate_log(
     def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    span = (
-        slice(None) if untouched_s is None else _rows_in_span(log.select_rows(known), *untouched_s)
-    )
+    shown = log.select_rows(known)
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
-            return residual[span].mean(axis=0), 1.0
+            return residual[_rows_in_span(shown, *untouched_s)].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
     offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
-    removed = identification.weight_removed or "weight" in log.estimated
+    removed = removed or "weight" in log.estimated
     _require_gravity_for_scales(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
@@ -515,17 +484,14 @@ def _read_and_eliminate_log(
         motion = aligned.log_with_differentiated_motion.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(
-                axis=0
-            )
-        causal_wrench = compute_causal_wrench(
+            rows = _rows_of_contact_free_start(log, causal_tare_s)
+            causal_offsets = untouched[rows].mean(axis=0)
+        both = (
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
             scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
-            log.dt,
-            cutoff_hz=cutoff_hz,
-            delay_s=delay_s,
-            mode=causal,
         )
+        options: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay_s": delay_s, "mode": causal}
+        causal_wrench = compute_causal_wrench(*both, log.dt, **options)
         causal_wrench = replace(
             causal_wrench,
             offsets=causal_offsets,
@@ -536,9 +502,9 @@ def _read_and_eliminate_log(
     findings = _find_suspected_errors(Path(path), log.wrench - offsets, contact, identification)
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
-    log = replace(log, notes=notes if findings else (*notes, *aligned.clock_notes))
+    shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
     return EliminatedLog(
-        log=log.select_rows(known),
+        log=shown,
         phi=phi,
         offsets=offsets,
         tare_fraction=fraction,
@@ -569,7 +535,7 @@ def _rows_in_span(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     return rows
 
 
-def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> Array:
+def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
@@ -578,7 +544,7 @@ def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> 
             where="causal_tare_s",
             remedy="give another contact-free start",
         )
-    return wrench[rows]
+    return rows
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
@@ -648,26 +614,18 @@ def _checked_scales(
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_FORCE_SCALE:
-            raise DrakeTeleopError(
-                f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}",
-                where=name,
-                remedy="give a scale, such as 0 or 1",
-            )
+            what = f"{value:g} is outside 0 to {_MAX_FORCE_SCALE:g}"
+            raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
     if sigma_object is not None and not split:
-        raise DrakeTeleopError(
-            "sigma_object requires a gripper",
-            where="sigma_object",
-            remedy="give the gripper's identification.json as well, or use sigma",
-        )
+        what = "sigma_object requires a gripper"
+        remedy = "give the gripper's identification.json as well, or use sigma"
+        raise DrakeTeleopError(what, where="sigma_object", remedy=remedy)
     if eta is None:
         kept = sigma if sigma_object is None else sigma_object
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
     if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
-        raise DrakeTeleopError(
-            "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)",
-            where="eta",
-            remedy="remove all scales except eta",
-        )
+        what = "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)"
+        raise DrakeTeleopError(what, where="eta", remedy="remove all scales except eta")
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
 
@@ -707,9 +665,7 @@ def detect_log(
     if found.log.static:
         raise _static_log_error(found.log)
     if found.detection is None:
-        raise DrakeTeleopError(
-            f"{len(found.log)} samples are too few to separate contact from noise",
-            where=found.log.source,
-            remedy=f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples",
-        )
+        what = f"{len(found.log)} samples are too few to separate contact from noise"
+        remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"
+        raise DrakeTeleopError(what, where=found.log.source, remedy=remedy)
     return DetectedLog(**vars(found.detection), eliminated=found)

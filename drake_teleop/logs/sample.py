@@ -19,7 +19,6 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.logs.figures import to_plain_values
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT, STANDARD_GRAVITY
 
 TRUE_MASS_KG, TRUE_COM_S = 0.95, np.array([0.004, -0.011, 0.058])
@@ -129,7 +128,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             _write_wrench(wrench_file, motion, touches, TRUE_OFFSETS[row], random)
             _write_pose(out / f"{name}_pose.csv", motion, random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
-        write_json(out / "truth.json", to_plain_values(_true_values()))
+        write_json(out / "truth.json", _true_values())
         summary = {
             "seed": seed,
             "files": [*files, "truth.json"],

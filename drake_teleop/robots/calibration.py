@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.normal_equations import NormalEquations
+from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import (
     Tolerance,
@@ -154,7 +154,7 @@ def advise_motion(
     `motion` is s, omega, alpha of the record, (N, 3) each.
     """
     rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
-    equations = NormalEquations(noise)
+    equations = SecondMoments(noise)
     equations.add_samples(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
     size = np.sqrt(np.diag(gram).max()) + 1.0

@@ -240,18 +240,16 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     `where` is the file's name for messages. Paths in the data are relative to its folder.
     """
     check_structure(Scenario, data, where)  # before the presets are read
-    blocks = {name: block or {} for name, block in data.items()}
-    master, sensor, control = (
-        blocks.get(name, {}) for name in ("master", "wrist_sensor", "joint_control")
+    sensor, master, control = (
+        data.get(name) or {} for name in ("wrist_sensor", "master", "joint_control")
     )
-    defaults = Scenario(
-        wrist_sensor=copy.deepcopy(PRESETS.get(sensor.get("preset"), WristSensorConfig()))
-    )
+    preset = PRESETS.get(str(sensor.get("preset")), WristSensorConfig())
+    defaults = Scenario(wrist_sensor=copy.deepcopy(preset))
     if master.get("figures") is not None:  # changes the data sheet
-        defaults.master.figures = copy.deepcopy(FIGURES.get(master.get("model")))
+        defaults.master.figures = copy.deepcopy(FIGURES.get(str(master.get("model"))))
     if control.get("interface") is not None:
-        interface = copy.deepcopy(POSITION_INTERFACES.get(control.get("servo")))
-        defaults.joint_control.interface = interface
+        interface = POSITION_INTERFACES.get(str(control.get("servo")))
+        defaults.joint_control.interface = copy.deepcopy(interface)
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
     absolute: Scenario = with_absolute_paths(scenario, Path(where).parent)

@@ -8,7 +8,7 @@ from scipy.signal import sosfilt
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.change import (
     STATE_CHANGED,
     STATE_IDENTIFIED,

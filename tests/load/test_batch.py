@@ -22,8 +22,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     transform_phi,
 )
-from drake_teleop.load.moments import NoiseStd
-from drake_teleop.load.normal_equations import identify
+from drake_teleop.load.normal_equations import NoiseStd, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.station.result import SimulationResult
 

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification, load_of_object
-from drake_teleop.load.moments import NoiseStd
+from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.change import (
     MIN_NEW_LOAD_AGE_S,
     OBJECT_PRIOR_STD,

@@ -13,7 +13,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
-from drake_teleop.load.moments import NoiseStd, SecondMoments
+from drake_teleop.load.normal_equations import NoiseStd, SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 
 ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))

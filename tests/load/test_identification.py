@@ -12,7 +12,7 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
-from drake_teleop.load.normal_equations import NormalEquations, _pseudo_inverse, identify
+from drake_teleop.load.normal_equations import SecondMoments, _pseudo_inverse, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
@@ -74,7 +74,7 @@ def test_chunks_and_order_do_not_matter():
     F, motion = record(3000)
     F = F + np.random.default_rng(2).normal(size=F.shape) * NOISE
     whole = identify(F, *motion, noise=NOISE)
-    in_chunks = NormalEquations(NOISE)
+    in_chunks = SecondMoments(NOISE)
     for part in np.split(np.arange(3000), [1, 2, 700, 701, 2222]):
         in_chunks.add_samples(F[part], *(x[part] for x in motion))
     in_chunks.add_samples(F[:0], *(x[:0] for x in motion))
@@ -109,7 +109,7 @@ def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
     rows = A.reshape(6 * n, 16)
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
-    equations = NormalEquations(weights**-0.5)
+    equations = SecondMoments(weights**-0.5)
     found, degrees = equations._unbiased_residual_variances(power, n, grams, grams, inverse)
     np.testing.assert_allclose(found, variances, rtol=1e-9)
     assert degrees.sum() == pytest.approx(6 * n - 16)

@@ -9,8 +9,7 @@ from load_cases import OFFSETS, TOOL, rich_motion
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import NoiseStd
-from drake_teleop.load.normal_equations import identify
+from drake_teleop.load.normal_equations import NoiseStd, identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench

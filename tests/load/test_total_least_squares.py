@@ -8,7 +8,12 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.total_least_squares import total_least_squares
-from drake_teleop.load.moments import NoiseStd, SecondMoments, normal_equations, residual_covariance
+from drake_teleop.load.normal_equations import (
+    NoiseStd,
+    SecondMoments,
+    normal_equations,
+    residual_covariance,
+)
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 TRUTH = np.concatenate([OFFSETS, TOOL])

@@ -25,8 +25,8 @@ LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleNamespace:
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
-    fit, data = SimpleNamespace(covariance=covariance), record(np.zeros((len(T), 6)))
-    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, contact_spans=spans)
+    data = record(np.zeros((len(T), 6)))
+    state = SimpleNamespace(model=model, x=x, covariance=covariance, data=data, contact_spans=spans)
     state.parameters_of_extension = partial(State.parameters_of_extension, state)
     return state
 
@@ -91,7 +91,7 @@ def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_b
     steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
     state = state_of(Model(steps=steps), values)
-    covariance = 4.0 * state.fit.covariance[:16, :16]
+    covariance = 4.0 * state.covariance[:16, :16]
     parts = loads_between_changes(state, covariance)
     assert [(x.start_s, x.stop_s) for x in parts] == [
         (pytest.approx(a), pytest.approx(b))

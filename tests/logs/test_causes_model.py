@@ -238,7 +238,7 @@ def test_deviations_widen_with_the_scatter_of_parts_and_with_a_smooth_misfit(
     ratio, smooth, parts, factor
 ):
     state = SimpleNamespace(
-        fit=SimpleNamespace(covariance=1e-12 * np.eye(40)),
+        covariance=1e-12 * np.eye(40),
         model=SimpleNamespace(extensions=parts),
         smooth_misfit=smooth,
         x=np.concatenate([OFFSETS, PHI]),

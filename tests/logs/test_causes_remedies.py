@@ -16,7 +16,8 @@ from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
+from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
+from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.explained_log import add_description_lines
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log

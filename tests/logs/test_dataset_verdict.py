@@ -143,15 +143,15 @@ def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
     signals = EpisodeSignals(log_of(x))
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
-    w = signals.reading_predictor(TRUE_PHI)("sensor", lag)
+    w = signals.predict_reading(TRUE_PHI, "sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)
     expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_PHI)
     np.testing.assert_allclose(w[1], expected, atol=1e-6)
     np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_PHI, expected, atol=1e-6)
-    weightless = signals.reading_predictor(TRUE_PHI)("weight removed", lag)[1]
+    weightless = signals.predict_reading(TRUE_PHI, "weight removed", lag)[1]
     weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_PHI)
     np.testing.assert_allclose(weightless, expected - weight, atol=1e-6)
-    turned = signals.reading_predictor(TRUE_PHI)("base", lag)[0]
+    turned = signals.predict_reading(TRUE_PHI, "base", lag)[0]
     for part in (slice(0, 3), slice(3, 6)):
         back = np.einsum("nij,nj->ni", at.R_WS, turned[:, part])
         np.testing.assert_allclose(back, x.wrench[:, part], atol=2e-3)

@@ -133,9 +133,9 @@ LIMITS = {
     "read.reading._CONVERTED_CHUNK_ROWS": 300,
     "read.alignment._INTERPOLATED_CHUNK_ROWS": 170,
     "pose_motion.splines._MAX_ROWS_PER_BLOCK": 260,
-    "posed_fit._MIN_SAMPLES_AT_REDUCED_RATE": 300,
-    "posed_fit._CHUNK_SAMPLES": 70,
-    "posed_fit._FILTER_NEIGHBOURS": 30,
+    "aligned_log._MIN_SAMPLES_AT_REDUCED_RATE": 300,
+    "aligned_log._CHUNK_SAMPLES": 70,
+    "aligned_log._FILTER_NEIGHBOURS": 30,
 }
 """What an hour at 1 kHz is too long for, so low that 10 s are."""
 

@@ -43,22 +43,6 @@ def test_solve_handles_a_zero_residual() -> None:
     np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # one half has a zero residual
 
 
-def test_solve_uses_given_linear_derivatives() -> None:
-    rng, calls = np.random.default_rng(4), []
-    maps, readings = rng.normal(size=(200, 6, 5)), rng.normal(size=(200, 6))
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        calls.append(x)
-        return np.sin(maps[:, :, :2] @ x[:2]) + maps[:, :, 2:] @ x[2:] - readings
-
-    found = nonlinear_least_squares(residual, np.zeros(5))
-    differenced = len(calls)
-    np.testing.assert_allclose(
-        nonlinear_least_squares(residual, np.zeros(5), maps[:, :, 2:]), found, rtol=1e-5
-    )
-    assert len(calls) - differenced < 0.7 * differenced
-
-
 @pytest.mark.parametrize("inverse", [False, True])
 @pytest.mark.parametrize("form", NUM_COLUMNS_OF_ROTATION_FORM)
 def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: bool) -> None:

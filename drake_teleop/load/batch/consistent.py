@@ -43,11 +43,9 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
 def _parameter_units(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError(
-            "the fitted mass is 0: the mass cannot be identified from this wrench",
-            where="wrench",
-            remedy="check that the sensor is connected and its orientation changes",
-        )
+        what = "the fitted mass is 0: the mass cannot be identified from this wrench"
+        remedy = "check that the sensor is connected and its orientation changes"
+        raise DrakeTeleopError(what, where="wrench", remedy=remedy)
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
     L = max(_MIN_LENGTH_UNIT_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
@@ -58,11 +56,9 @@ def _solve_consistent_fit(H: Array, b: Array) -> Array:
     cone.UpdateCoefficients(*_distance_cone_coefficients(H, b))
     result = solver.Solve(program)
     if not result.is_success():
-        raise DrakeTeleopError(
-            f"the semidefinite program has no solution ({result.get_solution_result().name})",
-            where="consistent",
-            remedy="check the sign of the wrench, and that the load moves",
-        )
+        what = f"the semidefinite program has no solution ({result.get_solution_result().name})"
+        remedy = "check the sign of the wrench, and that the load moves"
+        raise DrakeTeleopError(what, where="consistent", remedy=remedy)
     # The solver's tolerance leaves eigenvalues of about -1e-9.
     values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _PSEUDO_INERTIA_BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T

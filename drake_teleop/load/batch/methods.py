@@ -27,7 +27,7 @@ from drake_teleop.load.batch.uncertainty import (
     covariance_of_solution,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
-from drake_teleop.load.moments import (
+from drake_teleop.load.normal_equations import (
     SAMPLES_PER_CHUNK,
     NoiseStd,
     SecondMoments,
@@ -36,7 +36,6 @@ from drake_teleop.load.moments import (
     residual_covariance,
     root_of_pseudo_inverse,
 )
-from drake_teleop.load.normal_equations import NormalEquations
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_NOISE_OVER_RMS = 1e-7
@@ -69,7 +68,7 @@ class BatchResult:
     noise: Array
     rejected: NDArray[np.bool_]
     note: str
-    equations: NormalEquations
+    equations: SecondMoments
 
 
 def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -199,7 +198,7 @@ def identify_batch(
     record = SampleRecord(*rows)
     options = EstimatorOptions(noise or NoiseStd(), offsets, shared_noise)
     fit = METHODS[method].fit(record, options)
-    equations = NormalEquations(
+    equations = SecondMoments(
         np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
     )
     kept = ~fit.rejected

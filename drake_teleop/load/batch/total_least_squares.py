@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.moments import (
+from drake_teleop.load.normal_equations import (
     NoiseStd,
     SecondMoments,
     excited_columns,
@@ -58,11 +58,9 @@ def total_least_squares(
     """
     Z, Q = moments.mean_products, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
-        raise DrakeTeleopError(
-            "the wrench is 0 throughout: the mass cannot be identified",
-            where="wrench",
-            remedy="check that the sensor is connected and that its orientation changes",
-        )
+        what = "the wrench is 0 throughout: the mass cannot be identified"
+        remedy = "check that the sensor is connected and that its orientation changes"
+        raise DrakeTeleopError(what, where="wrench", remedy=remedy)
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)
@@ -122,11 +120,9 @@ def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: fl
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
 
-    return (
-        highest
-        if determinant_condition(highest) >= 0.0
-        else float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
-    )
+    if determinant_condition(highest) >= 0.0:
+        return highest
+    return float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,23 +9,23 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.total_least_squares import EstimatorFit, NormalForm, SampleRecord
 from drake_teleop.load.identification import (
     MAX_IDENTIFIED_STD_SHARE,
     PARAMETER_NAMES,
     Identification,
+    mark_undetermined,
     natural_scales,
 )
-from drake_teleop.load.moments import (
+from drake_teleop.load.normal_equations import (
     SAMPLES_PER_CHUNK,
+    SecondMoments,
     excited_columns,
     normal_equations,
     regressor_coefficients,
     root_of_pseudo_inverse,
 )
-from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
 _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
@@ -49,14 +49,7 @@ def confidence_intervals(load: Identification) -> tuple[Array, Array]:
 
 
 def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> NDArray[np.bool_]:
-    deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
-    if deviations.shape != prior.shape or not (prior > 0.0).all():
-        raise DrakeTeleopError(
-            f"has shape {prior.shape}, or values that are not positive",
-            where="prior_std",
-            remedy=f"give positive numbers of shape {deviations.shape}",
-        )
-    return np.asarray(deviations >= 0.5 * prior)
+    return np.asarray(np.asarray(standard_deviations) >= 0.5 * np.asarray(prior_std))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +116,7 @@ class BaseParameters:
         return lines
 
 
-def base_parameters(equations: NormalEquations) -> BaseParameters:
+def base_parameters(equations: SecondMoments) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scales(load.phi)
@@ -147,15 +140,10 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     R, order = qr(np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T, mode="r", pivoting=True)
     dependence = solve_triangular(R[:, :rank], R[:, rank:])
     dependence[np.abs(dependence) < _MIN_COMBINATION_COEFFICIENT] = 0.0
-    combinations = []
-    for row, i in enumerate(order[:rank]):
-        c = np.zeros(16)
-        c[i] = 1.0
-        others = [int(j) for j in order[rank:]]
-        for column, j in enumerate(others):
-            if dependence[row, column] != 0.0:
-                c[j] = dependence[row, column] * scale[i] / scale[j]
-        combinations.append(scaled_combination(c, int(i)))
+    rows = np.eye(16)[order[:rank]]
+    sizes = np.where(unexcited, np.inf, scale)[order[rank:]]
+    rows[:, order[rank:]] = dependence * scale[order[:rank], None] / sizes
+    combinations = [scaled_combination(c, int(i)) for c, i in zip(rows, order[:rank], strict=True)]
     combinations.sort(key=lambda c: c.leading_index)
 
     # Principal directions of determined but not identified parameters.
@@ -187,9 +175,7 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
-def covariance_for_white_noise(
-    plain: Array, equations: NormalEquations, fit: EstimatorFit
-) -> Array:
+def covariance_for_white_noise(plain: Array, equations: SecondMoments, fit: EstimatorFit) -> Array:
     """Return the covariance (16, 16) of a fit, for noise correlated between channels only."""
     W, Z = fit.form.weights, fit.moments.mean_products
     predicted = np.linalg.inv(W)
@@ -199,10 +185,7 @@ def covariance_for_white_noise(
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
     covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
-    unknown = np.isinf(np.diag(plain))
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
+    return mark_undetermined(covariance, np.isinf(np.diag(plain)))
 
 
 def _inverse_gram(fit: EstimatorFit) -> Array:
@@ -270,7 +253,4 @@ def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Arr
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
     covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
-    unknown = unknown | form.is_undetermined
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
+    return mark_undetermined(covariance, unknown | form.is_undetermined)

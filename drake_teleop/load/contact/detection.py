@@ -62,9 +62,8 @@ def update_statistics(
     hold_acceleration_peaks(memory, acceleration, alpha, fade)
     wrench_variance_by_parameters_into(s, omega, alpha, P, V, scaled)
     for c in range(6):
-        moving = (
-            growth[c, 0] * memory[HELD_ACCELERATION_INDEX] + growth[c, 1] * memory[HELD_ALPHA_INDEX]
-        )
+        moving = growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
+        moving += growth[c, 1] * memory[HELD_ALPHA_INDEX]
         variance = variances[c] + max(scaled[c], 0.0) + moving
         scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(variance)
     count = int(memory[SAMPLE_COUNT_INDEX])
@@ -73,13 +72,10 @@ def update_statistics(
         z = 0.0
         for j in range(i + 1):
             z += root[i, j] * scaled[j]
-        # The first sample has no predecessor.
-        e = (
-            z
-            if count == 0
-            else (z - rho[i] * memory[NORMALIZED_WRENCH_START + i])
-            / math.sqrt(1.0 - rho[i] * rho[i])
-        )
+        e = z
+        if count > 0:  # the first sample has no predecessor
+            e -= rho[i] * memory[NORMALIZED_WRENCH_START + i]
+            e /= math.sqrt(1.0 - rho[i] * rho[i])
         memory[NORMALIZED_WRENCH_START + i] = z
         level += z * z
         memory[CUSUM_START + i] += e
@@ -155,13 +151,9 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
         if memory[STATISTICS_START + statistic] >= enter:
             memory[FLAG_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
     else:
-        memory[QUIET_SAMPLES_INDEX] = (
-            memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
-        )
-        if (
-            memory[QUIET_SAMPLES_INDEX] > hold
-            and _sum_of_last_innovations(memory, hold, widths) < leave
-        ):
+        quiet = memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
+        memory[QUIET_SAMPLES_INDEX] = quiet
+        if quiet > hold and _sum_of_last_innovations(memory, hold, widths) < leave:
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG_INDEX] = 0.0
             memory[CUSUM_START:] = 0.0
@@ -210,11 +202,8 @@ class ContactDetector:
         column = statistic_index(statistic)
         enter = float(positive_array("threshold", threshold))
         if not 0.0 <= following < 1.0:
-            raise DrakeTeleopError(
-                f"{following} is outside the range 0 <= following < 1",
-                where="following",
-                remedy="give 0 to subtract no mean",
-            )
+            what = f"{following} is outside the range 0 <= following < 1"
+            raise DrakeTeleopError(what, where="following", remedy="give 0 to subtract no mean")
         decision = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
         self.settings = (floor.compiled_parameters, decision)
@@ -267,11 +256,9 @@ def fit_noise_floor(
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < 100:
-        raise DrakeTeleopError(
-            f"{len(rows[0])} samples are too few for a noise floor",
-            where="contact",
-            remedy="give 100 samples of free motion or more",
-        )
+        what = f"{len(rows[0])} samples are too few for a noise floor"
+        remedy = "give 100 samples of free motion or more"
+        raise DrakeTeleopError(what, where="contact", remedy=remedy)
     P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
     noise_std_into(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)

@@ -25,10 +25,8 @@ MAX_SUMMED_SAMPLES = 128
 NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
 """Number of windows: 1, 2, 4 ... MAX_SUMMED_SAMPLES samples."""
 
-HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
-    1,
-    2,
-)  # indices of held squares in the memory of a detector
+# Indices of held squares in the memory of a detector.
+HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = 1, 2
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
@@ -39,11 +37,9 @@ less often than that value, which is reached about once in a record of the same 
 
 def statistic_index(statistic: str) -> int:
     if statistic not in STATISTIC_NAMES:
-        raise DrakeTeleopError(
-            f"{statistic!r} is not a statistic",
-            where="statistic",
-            remedy=f"give one of {', '.join(STATISTIC_NAMES)}",
-        )
+        what = f"{statistic!r} is not a statistic"
+        remedy = f"give one of {', '.join(STATISTIC_NAMES)}"
+        raise DrakeTeleopError(what, where="statistic", remedy=remedy)
     return STATISTIC_NAMES.index(statistic)
 
 
@@ -96,26 +92,16 @@ class NoiseFloor:
         finite_array("per_acceleration", self.per_acceleration, 6, 2)
         correlation = finite_array("correlation", self.correlation, 6, 6)
         rho = finite_array("rho", self.rho, 6)
-        if (np.abs(rho) >= 1.0).any():
-            raise DrakeTeleopError(
-                "has a value that is not between -1 and 1",
-                where="rho",
-                remedy="call fit_noise_floor",
-            )
         positive_array("sum_widths", self.sum_widths, NUM_SUM_LENGTHS)
         finite_array("free_maxima", self.free_maxima, 3)
-        if not 0.0 <= self.fade < 1.0:
-            raise DrakeTeleopError(
-                f"{self.fade} is outside the range 0 <= fade < 1",
-                where="fade",
-                remedy="call fit_noise_floor",
-            )
-        if np.linalg.eigvalsh(correlation).min() <= 0.0:
-            raise DrakeTeleopError(
-                "the matrix is not positive definite",
-                where="correlation",
-                remedy="call fit_noise_floor",
-            )
+        indefinite = np.linalg.eigvalsh(correlation).min() <= 0.0
+        for is_wrong, where, what in (
+            ((np.abs(rho) >= 1.0).any(), "rho", "has a value that is not between -1 and 1"),
+            (not 0.0 <= self.fade < 1.0, "fade", f"{self.fade} is outside the range 0 <= fade < 1"),
+            (indefinite, "correlation", "the matrix is not positive definite"),
+        ):
+            if is_wrong:
+                raise DrakeTeleopError(what, where=where, remedy="call fit_noise_floor")
 
     def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
@@ -175,10 +161,8 @@ def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, ou
         hold_acceleration_peaks(memory, acceleration[k], alpha[k], fade)
         wrench_variance_by_parameters_into(s[k], omega[k], alpha[k], P, V, out[k])
         for c in range(6):
-            moving = (
-                growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
-                + growth[c, 1] * memory[HELD_ALPHA_INDEX]
-            )
+            moving = growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
+            moving += growth[c, 1] * memory[HELD_ALPHA_INDEX]
             out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
 
 

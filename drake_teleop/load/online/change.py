@@ -25,9 +25,7 @@ from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_MOTION,
     SAMPLE_WRENCH_AND_MOTION,
     non_contact_wrench_into,
     regressor_into,
@@ -59,18 +57,9 @@ _MAX_NEGATIVE_MASS_OVER_STD = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
-(
-    _STATE_INDEX,
-    _BASE_STATE_INDEX,
-    _BLOCK_SAMPLES_INDEX,
-    _SAMPLE_COUNT_INDEX,
-    _CUSUM_INDEX,
-    _RETURN_CUSUM_INDEX,
-    _ESTIMATE_AGE_INDEX,
-    _NEW_LOAD_START_INDEX,
-    _IDENTIFIED_SAMPLES_INDEX,
-    _ALPHA_SQUARES_INDEX,
-) = range(10)
+_STATE_INDEX, _BASE_STATE_INDEX, _BLOCK_SAMPLES_INDEX, _SAMPLE_COUNT_INDEX = range(4)
+_CUSUM_INDEX, _RETURN_CUSUM_INDEX, _ESTIMATE_AGE_INDEX, _NEW_LOAD_START_INDEX = range(4, 8)
+_IDENTIFIED_SAMPLES_INDEX, _ALPHA_SQUARES_INDEX = 8, 9
 _KNOWN_RESIDUAL_SQUARES_START, _NEW_RESIDUAL_SQUARES_START, _WRENCH_SUM_START = 10, 16, 22
 _MOTION_SUM_START, _REGRESSOR_SUM_START, _KNOWN_LOAD_START = 28, 37, 97
 _MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_LOAD_START + 272, _KNOWN_LOAD_START + 544
@@ -201,10 +190,8 @@ def _inflate_inertia_variances(memory, noise, block):
 def update_change_detector(memory, sample, block, noise, window, hold, bound):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
-    s = sample[SAMPLE_SPECIFIC_FORCE]
-    omega = sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
-    regressor_into(s, omega, alpha, V)
+    motion = sample[SAMPLE_MOTION]
+    regressor_into(motion[:3], motion[3:6], motion[6:], V)
     known = sample[SAMPLE_WRENCH_AND_MOTION]
     for i in range(15):
         memory[_WRENCH_SUM_START + i] += known[i]
@@ -249,10 +236,9 @@ def _test_block_for_change(memory, block, noise, window, hold, bound):
         memory[_ALPHA_SQUARES_INDEX] += memory[_MOTION_SUM_START + 6 + k] ** 2
     for c in range(6):
         residual = memory[_WRENCH_SUM_START + c] - memory[_NEW_FILTER_START + c]
+        row = memory[_REGRESSOR_SUM_START + 10 * c : _REGRESSOR_SUM_START + 10 * c + 10]
         for j in range(10):
-            residual -= (
-                memory[_REGRESSOR_SUM_START + 10 * c + j] * memory[_NEW_FILTER_START + 6 + j]
-            )
+            residual -= row[j] * memory[_NEW_FILTER_START + 6 + j]
         memory[_NEW_RESIDUAL_SQUARES_START + c] += residual * residual
     memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     # A clearly negative mass is not a load.
@@ -268,10 +254,10 @@ def _test_block_for_change(memory, block, noise, window, hold, bound):
         _inflate_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
         memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
-        for i in range(_NEW_RESIDUAL_SQUARES_START - _KNOWN_RESIDUAL_SQUARES_START):
-            memory[_KNOWN_RESIDUAL_SQUARES_START + i] = memory[_NEW_RESIDUAL_SQUARES_START + i] * (
-                block / memory[_ESTIMATE_AGE_INDEX]
-            )
+        share = block / memory[_ESTIMATE_AGE_INDEX]
+        for i in range(6):
+            squares = memory[_NEW_RESIDUAL_SQUARES_START + i]
+            memory[_KNOWN_RESIDUAL_SQUARES_START + i] = squares * share
         _restart_filter(memory, _MONITOR_FILTER_START)
 
 
@@ -303,16 +289,12 @@ def change_detector_parameters(
     """
     positive_array("period", period)
     if not 0.0 <= model_error < 1.0:
-        raise DrakeTeleopError(
-            f"{model_error} is outside the range 0 <= model_error < 1",
-            where="model_error",
-            remedy="give the relative error of the model",
-        )
-    bound = (
-        max(MAX_MASS_STD_OVER_CHANGE, 2.0 * model_error)
-        if bound is None
-        else float(positive_array("bound", bound))
-    )
+        what = f"{model_error} is outside the range 0 <= model_error < 1"
+        remedy = "give the relative error of the model"
+        raise DrakeTeleopError(what, where="model_error", remedy=remedy)
+    if bound is None:
+        bound = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * model_error)
+    positive_array("bound", bound)
     block = max(1, round(DETECTOR_BLOCK_DURATION_S / period))
     window, hold, memory = (
         max(1, round(x / (block * period)))
@@ -320,7 +302,7 @@ def change_detector_parameters(
     )
     std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
-    return block, np.append(noise, memory), window, hold, bound
+    return block, np.append(noise, memory), window, hold, float(bound)
 
 
 def initial_change_memory(
@@ -355,11 +337,8 @@ def stored_known_load(memory):
 @njit(cache=True)
 def current_change_state(memory):
     """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
-    return (
-        STATE_KNOWN
-        if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
-        else int(memory[_STATE_INDEX])
-    )
+    is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
+    return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
 
 
 @njit(cache=True)

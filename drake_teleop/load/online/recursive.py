@@ -18,13 +18,7 @@ from drake_teleop.load.identification import (
     Identification,
     is_precise_enough,
 )
-from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    regressor_into,
-)
+from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH, regressor_into
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
@@ -59,10 +53,8 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             for c in range(6):
                 squares[c] *= forgetting
 
-        wrench = sample[SAMPLE_WRENCH]
-        s = sample[SAMPLE_SPECIFIC_FORCE]
-        omega = sample[SAMPLE_ANGULAR_VELOCITY]
-        regressor_into(s, omega, sample[SAMPLE_ANGULAR_ACCELERATION], V)
+        wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
+        regressor_into(motion[:3], motion[3:6], motion[6:], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)
             for i in range(16):
@@ -114,11 +106,8 @@ class RecursiveEstimator(ABC):
         bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
-            raise DrakeTeleopError(
-                f"{forgetting} is outside the range 0 < forgetting <= 1",
-                where="forgetting",
-                remedy="give 1 for no forgetting",
-            )
+            what = f"{forgetting} is outside the range 0 < forgetting <= 1"
+            raise DrakeTeleopError(what, where="forgetting", remedy="give 1 for no forgetting")
         if not bound > 0.0:
             raise DrakeTeleopError(
                 f"{bound} is not positive", where="bound", remedy="give a number above 0"

@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.moments import regressor_coefficients
+from drake_teleop.load.normal_equations import regressor_coefficients
 from drake_teleop.load.online.recursive import (
     MAX_SETTLED_RELATIVE_STD,
     PRIOR_STD,
@@ -30,7 +30,7 @@ from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 # Relative increase of diagonal elements against rounding.
 RELATIVE_RIDGE = 1e-13
-# Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
+# Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
 _WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).

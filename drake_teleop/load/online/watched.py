@@ -25,8 +25,8 @@ from drake_teleop.load.online.change import (
     update_change_detector,
 )
 from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
     SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_MOTION,
     SAMPLE_SPECIFIC_FORCE,
     SAMPLE_WRENCH,
     non_contact_wrench_into,
@@ -124,29 +124,21 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     watch = memory[_CHANGE_DETECTOR_START:]
     update_change_detector(watch, sample, block, noise, window, hold, bound)
     known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
-    s = sample[SAMPLE_SPECIFIC_FORCE]
-    omega = sample[SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
-    non_contact_wrench_into(s, omega, alpha, known[6:], residual)
-    wrench = sample[SAMPLE_WRENCH]
+    wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
+    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest, verdict = _is_at_rest(memory, sample, period), current_change_state(watch)
     force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == STATE_KNOWN:
         memory[_STATE_INDEX] = STATE_SETTLED
-        if (
-            at_rest
-            and (np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6]) <= MAX_OFFSET_RESIDUAL).all()
-        ):
+        low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
+        if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        other = (
-            verdict == STATE_CHANGED
-            and force_changed
-            and _is_com_within_reach(known, stored_new_load(watch))
-        )
+        near = _is_com_within_reach(known, stored_new_load(watch))
+        other = verdict == STATE_CHANGED and force_changed and near
         memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
     if memory[_STATE_INDEX] == STATE_OTHER_LOAD:

@@ -91,11 +91,8 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
     for c in range(6):
         if c not in model.gain_channels:
             larger = state.refit(replace(model, gain_channels=(*model.gain_channels, c)))
-            if (
-                _MIN_CHANNEL_GAIN_ERROR
-                < abs(larger.parameters_of_extension(f"gain {c}")[0][0])
-                < _MAX_CHANNEL_GAIN_ERROR
-            ):
+            error = abs(larger.parameters_of_extension(f"gain {c}")[0][0])
+            if _MIN_CHANNEL_GAIN_ERROR < error < _MAX_CHANNEL_GAIN_ERROR:
                 yield _scored_candidate("gain", state, larger)
     if "frame" not in model.extensions and data.accelerates_enough:
         yield from _fit_extension(
@@ -139,11 +136,11 @@ def _fit_extension(
 
 
 def has_negative_mass(state: State) -> bool:
-    return bool(state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]))
+    return bool(state.x[6] < -4.0 * np.sqrt(state.covariance[6, 6]))
 
 
 def has_negative_inertia(state: State) -> bool:
-    if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.fit.covariance[6, 6]):
+    if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
@@ -151,7 +148,7 @@ def has_negative_inertia(state: State) -> bool:
     least, axes = np.linalg.eigh(inertia)
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
-    deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
+    deviation = float(np.sqrt(slope @ state.covariance[10:16, 10:16] @ slope))
     smallest = _NEGATIVE_INERTIA_OVER_SCALE * natural_scales(state.x[6:16])[10]
     return bool(least[0] < -max(_NEGATIVE_INERTIA_OVER_DEVIATION * deviation, smallest))
 
@@ -159,36 +156,44 @@ def has_negative_inertia(state: State) -> bool:
 def is_plausible(state: State) -> bool:
     if has_negative_inertia(state):
         return False
-    parts, deviation = state.model.extensions, float(np.sqrt(state.fit.covariance[6, 6]))
+    parts, deviation = state.model.extensions, float(np.sqrt(state.covariance[6, 6]))
     if "weight" in parts:
         removed = state.parameters_of_extension("weight")[0][0]
         # A robot adds no weight, and a removed weight requires an inertia to compare with.
         if removed < -0.01 * state.x[6] or state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
-    if (
-        "frame" in parts
-        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _MAX_POSE_SHIFT_M
-    ):
+    if "frame" in parts and _extension_magnitude(state, "frame") > _MAX_POSE_SHIFT_M:
         return False
     if "cable" in parts:
         if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
-        K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _MAX_CABLE_STIFFNESS_N_M)
+        return cable_stiffness(state) < _MAX_CABLE_STIFFNESS_N_M
     return True
 
 
+def cable_stiffness(state: State) -> float:
+    """Return the largest stiffness of a cable in any direction [N/m]."""
+    K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return float(np.abs(np.linalg.eigvalsh(K)).max())
+
+
 def _is_tilt_significant(state: State) -> bool:
-    assert state.data.gravity_W is not None
-    given = state.data.gravity_W
-    true = given - state.parameters_of_extension("gravity")[0]
-    size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
-    cosine = float(true @ given) / (size * right)
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    _, angle, ratio = true_gravity_and_tilt(state)
+    error = abs(ratio - 1.0)
     # Noise of the accelerations changes only the magnitude.
-    turned = np.radians(angle) > abs(size / right - 1.0)
+    turned = np.radians(angle) > error
     share = _MAX_GRAVITY_ERROR_TILTED if turned else _MAX_GRAVITY_ERROR_UPRIGHT
-    return bool(angle > _MIN_GRAVITY_TILT_DEG and abs(size / right - 1.0) < share)
+    return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
+
+
+def true_gravity_and_tilt(state: State) -> tuple[Array, float, float]:
+    """Return the estimated gravity (3,), and its angle [deg] and ratio to the described one."""
+    given = state.data.gravity_W
+    assert given is not None
+    true = given - state.parameters_of_extension("gravity")[0]
+    sizes = np.linalg.norm(true), np.linalg.norm(given)
+    angle = np.degrees(np.arccos(np.clip(true @ given / sizes[0] / sizes[1], -1.0, 1.0)))
+    return true, float(angle), float(sizes[0] / sizes[1])
 
 
 def start_parameters_of_tilt_fit(state: State) -> Array | None:
@@ -230,10 +235,14 @@ def _is_removed_weight_large(state: State) -> bool:
     return bool(removed[0] > _MIN_REMOVED_MASS_SHARE * mass or moment > _MIN_REMOVED_MOMENT_ARM_M)
 
 
-def _is_drift_significant(state: State) -> bool:
+def drift_amplitudes(state: State) -> Array:
+    """Return the largest drift (6,) of the offsets from their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
-    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
-    return bool((np.abs(rows).sum(axis=1) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
+    return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
+
+
+def _is_drift_significant(state: State) -> bool:
+    return bool((drift_amplitudes(state) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
 
 
 def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
@@ -251,9 +260,8 @@ def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
         best = max(low, key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    best = state.refit(
-        best.model, best.x, **({"steps": _TORQUE_FACTOR_ITERATIONS} if by_residual else {})
-    )
+    options = {"steps": _TORQUE_FACTOR_ITERATIONS} if by_residual else {}
+    best = state.refit(best.model, best.x, **options)
     if 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
     free = best.refit(best.model.with_extension("torque factor"))

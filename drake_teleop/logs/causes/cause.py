@@ -9,13 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import axis_names
+from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import fits_with_other_torque_units
+from drake_teleop.logs.causes.candidates import (
+    cable_stiffness,
+    drift_amplitudes,
+    fits_with_other_torque_units,
+    true_gravity_and_tilt,
+)
 from drake_teleop.logs.causes.state import State
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
-CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
 CAUSES_WITHOUT_CORRECTION = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
@@ -69,20 +75,18 @@ def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cau
         "linear drift": _drift_cause,
         "drift": _drift_cause,
     }
-    out += [
-        makers[name](state)
-        for name in model.extensions
-        if name in makers and name not in always_fitted
-    ]
+    named = [name for name in model.extensions if name in makers and name not in always_fitted]
+    out += [makers[name](state) for name in named]
     if model.torque_factor != 1.0:
         out.append(_torque_factor_cause(state))
     out += [_gain_error_cause(state, c) for c in model.gain_channels]
     changes = [_offset_or_load_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
-    contacts = [
-        span for span in state.contact_spans if not _is_hand_contact(span, model.step_times)
+    changes += [
+        _contact_cause(start + margin, stop - margin)
+        for start, stop in state.contact_spans
+        if not _is_hand_contact((start, stop), model.step_times)
     ]
-    changes += [_contact_cause(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
@@ -92,12 +96,12 @@ def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWit
     if not loads:
         return []
     first, last = float(state.data.t[0]), float(state.data.t[-1])
-    ratio = np.sqrt(np.diag(covariance) / np.diag(state.fit.covariance)[:16])
+    ratio = np.sqrt(np.diag(covariance) / np.diag(state.covariance)[:16])
     map_ = np.zeros((16, state.model.size))
     map_[:, :16] = np.eye(16)
     out, start = [], first
     for time, i in [*sorted(loads), (last, -1)]:
-        spread = map_ @ state.fit.covariance @ map_.T * np.outer(ratio, ratio)
+        spread = map_ @ state.covariance @ map_.T * np.outer(ratio, ratio)
         out.append(RecordPartWithLoad(start, time, (map_ @ state.x)[6:], spread))
         if i >= 0:
             map_ = map_.copy()
@@ -111,7 +115,7 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
 
 
 def _wrong_axes_cause(Q: Array) -> Cause:
-    rows = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in Q]
+    rows = axis_names(Q)
     what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
         what = "the wrench has the opposite sign"
@@ -119,16 +123,8 @@ def _wrong_axes_cause(Q: Array) -> Cause:
 
 
 def _gravity_direction_cause(state: State) -> Cause:
-    assert state.data.gravity_W is not None
-    change, covariance = state.parameters_of_extension("gravity")
-    given = state.data.gravity_W
-    true = given - change
-    cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    size = float(np.linalg.norm(true))
-    across = np.eye(3) - np.outer(true, true) / size**2
-    spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
-    wide = float(np.degrees(np.sqrt(spread) / size))
+    true, angle, _ = true_gravity_and_tilt(state)
+    wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
     return Cause(
         "gravity direction",
         f"gravity is {angle:.2f} deg (+- {1.96 * wide:.2g}) off the described direction in the base"
@@ -137,11 +133,19 @@ def _gravity_direction_cause(state: State) -> Cause:
     )
 
 
+def direction_std_deg(x: Array, covariance: Array) -> float:
+    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
+    size = float(np.linalg.norm(x))
+    across = np.eye(3) - np.outer(x, x) / size**2
+    spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    return float(np.degrees(np.sqrt(spread) / size))
+
+
 def _removed_weight_cause(state: State) -> Cause:
     removed, covariance = state.parameters_of_extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
-    own = float(np.sqrt(state.fit.covariance[6, 6]))
+    own = float(np.sqrt(state.covariance[6, 6]))
     values = {"removed_mass": float(removed[0]), "removed_moment": removed[1:].tolist()}
     if abs(removed[0] - mass) < 0.02 * mass + 4.0 * np.hypot(deviation, own):
         return Cause(
@@ -208,9 +212,7 @@ def _sensor_rotation_cause(state: State) -> Cause:
 
 
 def _drift_cause(state: State) -> Cause:
-    name = "drift" if "drift" in state.model.extensions else "linear drift"
-    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
-    size = 2.0 * np.abs(rows).sum(axis=1)
+    size = 2.0 * drift_amplitudes(state)
     return Cause(
         "drift",
         f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
@@ -220,8 +222,7 @@ def _drift_cause(state: State) -> Cause:
 
 
 def _cable_cause(state: State) -> Cause:
-    K = state.parameters_of_extension("cable")[0][3:9]
-    stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
+    stiffness = cable_stiffness(state)
     return Cause(
         "cable",
         f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
@@ -255,18 +256,14 @@ def _offset_or_load_step_cause(state: State, i: int) -> Cause:
 
 
 def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    near = any(
-        span[0] - _MAX_HAND_CONTACT_TO_STEP_S < time < span[1] + _MAX_HAND_CONTACT_TO_STEP_S
-        for time in times
-    )
+    start, stop = span[0] - _MAX_HAND_CONTACT_TO_STEP_S, span[1] + _MAX_HAND_CONTACT_TO_STEP_S
+    near = any(start < time < stop for time in times)
     return near and span[1] - span[0] < _MAX_HAND_CONTACT_DURATION_S
 
 
 def _contact_cause(start: float, stop: float) -> Cause:
-    return Cause(
-        "contact",
+    text = (
         f"from t = {start:.2f} to {stop:.2f} s the load is in contact or the sensor is saturated;"
-        " this part is not used",
-        start_s=start,
-        stop_s=stop,
+        " this part is not used"
     )
+    return Cause("contact", text, start_s=start, stop_s=stop)

@@ -74,10 +74,10 @@ class _StepScan:
     """Likelihood gain by a change of offsets or load at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
-        power = np.maximum(state.rows.residual_rms(state.fit.residual), 1e-12)
+        power = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
         J = state.model.wrench_derivative(state.x) / power[:, None]
         self._columns = state.rows.y @ J.transpose(1, 2, 0)  # (6, M, p)
-        self._residual = (state.rows.y @ (state.fit.residual / power[:, None]).T).T
+        self._residual = (state.rows.y @ (state.residual / power[:, None]).T).T
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         self._rows = rows = state.data.rows_per_block
         starts = np.arange(0, len(state.data.t), rows)
@@ -143,7 +143,7 @@ def remove_small_steps(state: State) -> State:
 
 def _squared_step_over_variance(state: State, i: int) -> float:
     where = state.model.parameter_slices[f"step {i}"]
-    x, covariance = state.x[where], state.fit.covariance[where, where]
+    x, covariance = state.x[where], state.covariance[where, where]
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
@@ -159,7 +159,7 @@ def _estimate_ramp_middle(
     def residual_with_steps_at(time: float) -> Array:
         times = tuple(time if i in own else x.time for i, x in enumerate(state.model.steps))
         y = data.append_step_signals(times)[rows][:, state.model.columns]
-        return np.asarray(y @ state.fit.residual.T)
+        return np.asarray(y @ state.residual.T)
 
     before = residual_with_steps_at(span[1] + data.dt)
     whole = before - residual_with_steps_at(span[0] - data.dt)
@@ -178,9 +178,8 @@ def _refine_step_time(state: State, kind: str, time: float) -> State:
     for share in _STEP_TIME_MOVES_INSTANTS:
         for _ in range(_MAX_STEP_TIME_MOVES):
             now = best.model.steps[-1].time
-            tried = [
-                fit_with_step_at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)
-            ]
+            move = share * state.data.dt
+            tried = [fit_with_step_at(now + x, best.x) for x in (-move, move)]
             better = max(tried, key=lambda x: x.likelihood)
             if not better.likelihood > best.likelihood + 1e-3:
                 break
@@ -191,12 +190,11 @@ def _refine_step_time(state: State, kind: str, time: float) -> State:
 def _is_step_significant(state: State, i: int) -> bool:
     where = state.model.parameter_slices[f"step {i}"]
     values = state.x[where]
-    deviations = np.sqrt(np.diag(state.fit.covariance[where, where]))
+    deviations = np.sqrt(np.diag(state.covariance[where, where]))
     if state.model.steps[i].kind == "offsets":
         clear = np.abs(values) > _MIN_STEP_OVER_DEVIATION * deviations
-        return bool(
-            (clear & (np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise)).any()
-        )
+        large = np.abs(values) > _MIN_OFFSET_STEP_OVER_NOISE * state.data.wrench_noise
+        return bool((clear & large).any())
     mass = max(abs(state.x[6]), 1e-3)
     heavier = abs(values[0]) > max(
         _MIN_STEP_OVER_DEVIATION * deviations[0], _MIN_MASS_STEP_OVER_MASS * mass
@@ -286,8 +284,8 @@ class _ResidualBlocks:
         for c in range(6):
             weighted = J[:, c] @ sums / scale[c] ** 2
             self._gram += weighted @ J[:, c].T
-            self._right += weighted @ state.fit.residual[c]
-            left = state.fit.residual[c] / scale[c]
+            self._right += weighted @ state.residual[c]
+            left = state.residual[c] / scale[c]
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
@@ -318,9 +316,8 @@ class _ResidualBlocks:
             if share == _TRIMMED_FIT_BLOCK_SHARES[1]:
                 usual = min(usual, float(np.median(level[last])))
         for length in _TRIED_END_RUN_LENGTHS_BLOCKS:
-            level, move, last = self._trimmed_fit_of_blocks(
-                blocks, np.r_[blocks[:length], blocks[-length:]], 0.0
-            )
+            ends = np.r_[blocks[:length], blocks[-length:]]
+            level, move, last = self._trimmed_fit_of_blocks(blocks, ends, 0.0)
             calm = float(np.median(level[last]))
             if self._do_other_blocks_differ(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
@@ -336,10 +333,8 @@ class _ResidualBlocks:
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
-        return bool(
-            np.mean(level[others] > _CONTACT_RMS_OVER_CALM**2 * predicted)
-            > 1.0 - _MAX_UNFITTED_BLOCK_SHARE
-        )
+        differ = np.mean(level[others] > _CONTACT_RMS_OVER_CALM**2 * predicted)
+        return bool(differ > 1.0 - _MAX_UNFITTED_BLOCK_SHARE)
 
     def _trimmed_fit_of_blocks(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
@@ -394,9 +389,8 @@ def replace_steps_by_contact(state: State) -> State:
             return State.fit_record(state.data, model, x, (*state.contact_spans, span))
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
             calm = State.fit_record(state.data, model, x, (*state.contact_spans, span))
-            if calm.residual_ratio < min(
-                _CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM
-            ):
+            limit = min(_CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM)
+            if calm.residual_ratio < limit:
                 return shrink_contacts(calm)
     return state
 
@@ -414,10 +408,8 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
     data = state.data
     inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
-    usual = np.maximum(
-        np.maximum(data.wrench_noise, state.rows.residual_rms(state.fit.residual)), 1e-12
-    )
-    large = (np.abs(y[inside] @ state.fit.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
+    usual = np.maximum(data.wrench_noise, state.rows.residual_rms(state.residual)).clip(1e-12)
+    large = (np.abs(y[inside] @ state.residual.T) > _CONTACT_RMS_OVER_CALM * usual).any(axis=1)
     first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
     if not len(first):
         return span
@@ -429,7 +421,7 @@ def _median_residual_over_noise(state: State, span: tuple[float, float]) -> floa
     chosen = state.rows.used & is_in_time_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
-    e = np.abs(state.rows.y[chosen] @ state.fit.residual.T)
+    e = np.abs(state.rows.y[chosen] @ state.residual.T)
     return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.wrench_noise, 1e-12)).max())
 
 
@@ -439,6 +431,6 @@ def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
         return False
     a, b = (state.model.parameter_slices[f"step {k}"] for k in (i, j))
     both = state.x[a] + state.x[b]
-    covariance = state.fit.covariance
+    covariance = state.covariance
     variance = np.diag(covariance[a, a] + covariance[b, b] + 2.0 * covariance[a, b])
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())

@@ -76,11 +76,8 @@ def residual_is_noise(state: State) -> bool:
     if state.data.gravity_W is not None:
         parts += ["gravity", "weight"]
     larger = [model.with_extension(name) for name in parts if name not in model.extensions]
-    larger += [
-        replace(model, gain_channels=(*model.gain_channels, c))
-        for c in range(6)
-        if c not in model.gain_channels
-    ]
+    others = set(range(6)) - set(model.gain_channels)
+    larger += [replace(model, gain_channels=(*model.gain_channels, c)) for c in sorted(others)]
     return all(state.score_of_larger_model(x) < MAX_NOISE_EXTENSION_SCORE for x in larger)
 
 
@@ -116,11 +113,13 @@ def search_causes(
     better = (
         residual_is_noise(repeated[0])
         or repeated[0].likelihood > found[0].likelihood + _MIN_CAUSE_SCORE
-    )
-    better = better or (
-        repeated[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
+        or _is_residual_much_smaller(repeated[0], found[0])
     )
     return repeated if better else found
+
+
+def _is_residual_much_smaller(state: State, other: State) -> bool:
+    return state.residual_ratio < _MUCH_SMALLER_RESIDUAL * other.residual_ratio
 
 
 def may_be_coloured_noise(state: State) -> bool:
@@ -156,11 +155,13 @@ def _search_causes_from(
         found = _remove_cable_if_attenuated(list(fit_candidates(state, first=number == 0)))
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
-        winner, calmest = (
-            _best_candidate(effective),
-            _candidate_with_smallest_residual(state, rejected),
-        )
-        if winner is None or _has_much_smaller_residual(calmest, winner):
+        winner = _best_candidate(effective)
+        calmest = _candidate_with_smallest_residual(state, rejected)
+        if winner is None or (
+            calmest is not None
+            and calmest.name != "contact"
+            and _is_residual_much_smaller(calmest.state, winner.state)
+        ):
             winner = calmest
         if winner is None:
             explained = _explain_contact_by_steps(state, rejected)
@@ -207,28 +208,17 @@ def _apply_fitted_delay(
 
 def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
     small = [x for x in found if x.name in _CAUSES_LIKE_COLOURED_NOISE]
-    small = [
-        x for x in small if x.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * state.residual_ratio
-    ]
+    small = [x for x in small if _is_residual_much_smaller(x.state, state)]
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
     return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)
 
 
-def _has_much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
-    if calmest is None or calmest.name == "contact":
-        return False
-    return calmest.state.residual_ratio < _MUCH_SMALLER_RESIDUAL * winner.state.residual_ratio
-
-
 def _explain_contact_by_steps(state: State, found: list[Candidate]) -> State | None:
-    for candidate in found:
-        if (
-            candidate.name == "contact"
-            and candidate.state.residual_ratio < _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
-        ):
-            return replace_contacts_by_steps(candidate.state)
-    return None
+    limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
+    contacts = (x.state for x in found if x.name == "contact")
+    calm = next((x for x in contacts if x.residual_ratio < limit), None)
+    return None if calm is None else replace_contacts_by_steps(calm)
 
 
 def _is_misfit_reduced(candidate: Candidate, state: State) -> bool:
@@ -250,19 +240,13 @@ def _best_candidate(found: list[Candidate]) -> Candidate | None:
     if best < _MIN_CAUSE_SCORE:
         return None
     top = max(found, key=lambda x: x.score).name
-    margin = (
-        max(_NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE * best)
-        if top not in _FLEXIBLE_CAUSES
-        else max(_FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE * best)
-    )
+    margin = max(_NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE * best)
+    if top in _FLEXIBLE_CAUSES:
+        margin = max(_FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE * best)
     near = [x for x in found if x.score > max(_MIN_CAUSE_SCORE, best - margin)]
     first = min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name))
-    return (
-        first
-        if first.score
-        > _MIN_CAUSE_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
-        else None
-    )
+    least = _MIN_CAUSE_SCORE * max(1.0, first.state.smooth_misfit / GOOD_SMOOTH_MISFIT) ** 1.5
+    return first if first.score > least else None
 
 
 _MAX_ABSENT_MASS_KG, _ABSENT_MASS_OVER_DEVIATION, _PRESENT_MASS_OVER_DEVIATION = 0.010, 4.0, 20.0
@@ -320,11 +304,8 @@ def explain_misfit(
         covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, always_fitted)
         only_noise = residual_is_noise(state)
-        if (
-            not causes
-            and (only_noise or may_be_coloured_noise(state))
-            and _is_load_absent(state, covariance)
-        ):
+        noisy = only_noise or may_be_coloured_noise(state)
+        if not causes and noisy and _is_load_absent(state, covariance):
             causes = [_no_load_cause(state, covariance)]
         removed = None
         if "weight" in state.model.extensions:
@@ -345,17 +326,11 @@ def explain_misfit(
 
 def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
-    least = max(
-        _ABSENT_MASS_OVER_DEVIATION * deviation,
-        min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation),
-    )
-    return bool(mass < least and deviation < 0.1)
+    largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
+    return bool(mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1)
 
 
 def _no_load_cause(state: State, covariance: Array) -> Cause:
     most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
-    return Cause(
-        "no load",
-        f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets",
-        values={"mass_limit": most},
-    )
+    text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
+    return Cause("no load", text, values={"mass_limit": most})

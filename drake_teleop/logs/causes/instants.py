@@ -140,9 +140,8 @@ def block_means_of_record(
     y = np.zeros((rows, NUM_SIGNALS))
     y[:, CONSTANT_COLUMN] = 1.0
     y[:, WRENCH_SIGNALS] = wrench.reshape(rows, size, 6).mean(axis=1)
-    y[1:-1, WRENCH_RATE_SIGNALS] = (y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]) / (
-        2.0 * size * dt
-    )
+    change = y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]
+    y[1:-1, WRENCH_RATE_SIGNALS] = change / (2.0 * size * dt)
     positions = _write_motion_signals(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
     # Legendre polynomials.
@@ -190,31 +189,20 @@ def _smallest_noise_variance_share(x: Array) -> float:
 def _write_motion_signals(
     y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
-    rows = len(y)
-    if not callable(motion):
-        columns = _motion_signal_columns([x[: rows * size] for x in motion], gravity_W)
-        _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
-        return len(motion) == 5
-    if size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
-        found = motion(t)
-        columns = _motion_signal_columns(found, gravity_W)
-        _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
-        return len(found) == 5
-    # Simpson's rule over an interval with the variance of `size` samples.
-    dt = float(t[-1] - t[0]) / (len(t) - 1)
-    middle = t.reshape(rows, size).mean(axis=1)
-    half = 0.5 * dt * np.sqrt(size**2 - 1.0)
-    total = np.zeros(())
-    for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
-        found = motion(middle + shift)
-        total = total + weight / 6.0 * _motion_signal_columns(found, gravity_W)
-    _write_signal_columns(y, total)
+    rows, total = len(y), np.zeros(())
+    if not callable(motion) or size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
+        found = motion(t) if callable(motion) else tuple(x[: len(t)] for x in motion)
+        total = _motion_signal_columns(found, gravity_W).reshape(rows, size, -1).mean(axis=1)
+    else:  # Simpson's rule over an interval with the variance of `size` samples
+        dt = float(t[-1] - t[0]) / (len(t) - 1)
+        middle = t.reshape(rows, size).mean(axis=1)
+        half = 0.5 * dt * np.sqrt(size**2 - 1.0)
+        for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
+            found = motion(middle + shift)
+            total = total + weight / 6.0 * _motion_signal_columns(found, gravity_W)
+    y[:, 1:16], rest = total[:, :15], total[:, 15:]
+    y[:, ROTATION_SIGNALS.start : ROTATION_SIGNALS.start + rest.shape[1]] = rest
     return len(found) == 5
-
-
-def _write_signal_columns(y: Array, columns: Array) -> None:
-    y[:, 1:16] = columns[:, :15]
-    y[:, ROTATION_SIGNALS.start : ROTATION_SIGNALS.start + columns.shape[1] - 15] = columns[:, 15:]
 
 
 def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
@@ -249,9 +237,8 @@ def delay_of_free_fit(data: Instants) -> float:
         left = total - ((x.T @ forces) * found).sum(axis=0)
         return float(np.log(np.maximum(left, 1e-12 * total + 1e-30)).sum())
 
-    shifts = (
-        np.arange(-round(reach / _DELAY_STEP_S), round(reach / _DELAY_STEP_S) + 1) * _DELAY_STEP_S
-    )
+    steps = round(reach / _DELAY_STEP_S)
+    shifts = np.arange(-steps, steps + 1) * _DELAY_STEP_S
     costs = np.array([log_residual(x) for x in shifts])
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):

@@ -36,7 +36,7 @@ def load_covariance(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
-    out = state.fit.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
+    out = state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = widening_factor_by_misfit(state, blocks)
     squares = np.maximum(factor * deviations, blocks) ** 2
@@ -49,11 +49,10 @@ def load_deviations_if_unexplained(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
-    if state.smooth_misfit > (
-        _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
-        if state.residual_ratio > _LARGE_RESIDUAL_RATIO
-        else _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
-    ):
+    least = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
+    if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
+        least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
+    if state.smooth_misfit > least:
         blocks = blocks * (1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
     variance = blocks**2 + _variances_of_rejected_causes(state, lasting) + np.diag(gains)
@@ -64,28 +63,25 @@ def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
-        share = (
-            min(1.0, candidate.score / _FULLY_WIDENING_SCORE)
-            if candidate.score > _MIN_WIDENING_SCORE
-            else 0.0
-        )
+        share = min(1.0, candidate.score / _FULLY_WIDENING_SCORE)
+        if candidate.score <= _MIN_WIDENING_SCORE:
+            share = 0.0
         if other.residual_ratio < _FULLY_WIDENING_RESIDUAL_SHARE * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
-        own = np.diag(other.fit.covariance)[OFFSETS_AND_LOAD]
+        own = np.diag(other.covariance)[OFFSETS_AND_LOAD]
         squares += share * ((other.x[OFFSETS_AND_LOAD] - state.x[OFFSETS_AND_LOAD]) ** 2 + own)
     return squares
 
 
 def load_covariance_by_gain_errors(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
-    fit, rows = state.fit, state.rows
-    weights = rows.whitened_products(fit.noise_filters) / fit.noise_power[:, None, None]
+    rows = state.rows
+    weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
     unit = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
-    wrench = (
-        rows.columns == np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)[:, None]
-    ) - fit.residual
-    J, inverse = state.model.wrench_derivative(state.x), fit.covariance
+    channels = np.arange(WRENCH_SIGNALS.start, WRENCH_SIGNALS.stop)
+    wrench = (rows.columns == channels[:, None]) - state.residual
+    J, inverse = state.model.wrench_derivative(state.x), state.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
         own = slice(6 * c, 6 * c + 6)
@@ -93,7 +89,7 @@ def load_covariance_by_gain_errors(state: State) -> Array:
         weighted = columns @ weights[c]
         mixed[:, own] = J[:, c] @ weighted.T
         gram[own, own] = weighted @ columns.T
-        right[own] = weighted @ fit.residual[c]
+        right[own] = weighted @ state.residual[c]
     schur = gram - mixed.T @ inverse @ mixed
     values, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
     shown = values > 1e-9 * values[-1]
@@ -124,18 +120,18 @@ def load_covariance_by_torque_unit(state: State) -> Array:
 
 def load_bias_by_alpha_noise(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
-    fit, data = state.fit, state.data
+    data = state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))
     variance = white_noise_deviations(data.y[data.used][:, ALPHA_SIGNALS]) ** 2
-    weights = state.rows.used.sum() * (fit.noise_filters**2).sum(axis=1) / fit.noise_power
+    weights = state.rows.used.sum() * (state.noise_filters**2).sum(axis=1) / state.noise_power
     J = state.model.wrench_derivative(state.x)[:, :, at]
-    right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
-    return np.asarray((fit.covariance @ right)[OFFSETS_AND_LOAD])
+    right = np.einsum("pck,ck,c,k->p", J, state.residual[:, at], weights, variance)
+    return np.asarray((state.covariance @ right)[OFFSETS_AND_LOAD])
 
 
 def widening_factor_by_misfit(state: State, blocks: Array) -> float:
     """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
-    deviations = np.sqrt(np.diag(state.fit.covariance)[OFFSETS_AND_LOAD])
+    deviations = np.sqrt(np.diag(state.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
@@ -150,13 +146,13 @@ def jackknife_load_deviations(state: State) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)
-    whole, right = state.fit.normal_equations(state.model, state.x)
+    whole, right = state.normal_equations(state.model, state.x)
     moves = []
     for part in at:
         used = np.zeros(len(rows.used), bool)
         used[part] = True
         few = UsedRows(rows.data, used, rows.times, rows.columns)
-        gram, pull = replace(state.fit, rows=few).normal_equations(state.model, state.x)
+        gram, pull = replace(state, rows=few).normal_equations(state.model, state.x)
         moves.append((regularized_inverse(whole - gram) @ (right - pull))[OFFSETS_AND_LOAD])
     spread = np.array(moves) - np.mean(moves, axis=0)
     return np.asarray(

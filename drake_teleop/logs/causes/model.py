@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
+from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA_SIGNALS,
     CONSTANT_COLUMN,

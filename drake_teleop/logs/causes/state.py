@@ -111,8 +111,11 @@ _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS 
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 
 
+_NUM_SMOOTH_SEGMENTS = 6
+
+
 @dataclass(frozen=True, eq=False)
-class ModelFit:
+class State:
     """Model with parameters x (size,), fitted to rows of a record.
 
     Attributes:
@@ -120,6 +123,7 @@ class ModelFit:
         residual: (6, W) coefficients of the residual in the signals y.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
+        contact_spans: (start, stop) of contacts, whose rows are not used [s].
     """
 
     model: Model
@@ -129,11 +133,35 @@ class ModelFit:
     residual: Array
     noise_filters: Array
     noise_power: Array
+    contact_spans: TimeSpans = ()
+
+    @classmethod
+    def fit_record(
+        cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
+    ) -> State:
+        used = data.used & ~is_in_time_spans(data, spans)
+        return fit_model(model, UsedRows(data, used, model.step_times, model.columns), start, spans)
+
+    def refit(self, model: Model, start: Array | None = None, **options: int) -> State:
+        if start is None:
+            start = model.start_parameters(self.x, self.model)
+        rows = self._rows_for_model(model)
+        return fit_model(model, rows, start, self.contact_spans, **options)
+
+    def _rows_for_model(self, model: Model) -> UsedRows:
+        rows = self.rows
+        if rows.times == model.step_times and np.array_equal(rows.columns, model.columns):
+            return rows
+        return UsedRows(self.data, rows.used, model.step_times, model.columns)
 
     @property
-    def likelihood(self) -> float:
-        """Logarithm of the likelihood up to a constant."""
-        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.noise_power).sum())
+    def data(self) -> Instants:
+        return self.rows.data
+
+    def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
+        """Return the parameters of a named extension of the model, and their covariance."""
+        where = self.model.parameter_slices[name]
+        return self.x[where], self.covariance[where, where]
 
     def normal_equations(self, model: Model, x: Array) -> tuple[Array, Array]:
         """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
@@ -144,26 +172,80 @@ class ModelFit:
         right = (weighted @ self.residual[:, :, None]).sum(axis=0)[:, 0]
         return 0.5 * (gram + gram.T), right
 
+    @cached_property
+    def likelihood(self) -> float:
+        """Logarithm of the likelihood of all rows; contacts have separate noise."""
+        count = len(self.rows.rows_with_predecessors)
+        own = -0.5 * count * float(np.log(self.noise_power).sum())
+        if not self.contact_spans:
+            return own
+        used = self.data.used & ~self.rows.used
+        inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
+        power = inside.noise_filters_and_power(self.residual, 1e-6 * self.noise_power)[1]
+        # Rows at the edges of contacts count as noise of this power, too.
+        every = UsedRows(self.data, self.data.used, (), self.model.columns)
+        others = len(every.rows_with_predecessors) - count
+        return own - 0.5 * others * float(np.log(power).sum())
+
+    @cached_property
+    def residual_ratio(self) -> float:
+        """RMS residual over white noise, in the channel where this ratio is largest."""
+        white = np.maximum(self.data.wrench_noise, 1e-12)
+        return float(np.max(self.rows.residual_rms(self.residual) / white))
+
+    @cached_property
+    def smooth_misfit(self) -> float:
+        """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
+        gain, freedom = self.gain_by_smooth_signals
+        return gain / max(1, freedom - self.model.size)
+
+    @cached_property
+    def gain_by_smooth_signals(self) -> tuple[float, int]:
+        """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
+        y = self.data.y
+        part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
+        parts = [y[:, : OMEGA_PRODUCTS.stop]]
+        if self.data.gravity_W is not None:
+            parts.append(y[:, ROTATION_SIGNALS])
+        if self.data.has_positions:
+            parts.append(y[:, R_P_PRODUCTS] @ _cable_stiffness_selector().T)
+        columns = np.hstack([*parts, part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS)])
+        e = self.rows.y @ self.residual.T
+        whole, filters = self.rows.rows_with_predecessors, self.noise_filters
+        gain, freedom = 0.0, 0
+        late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
+        for c in range(6):
+            x = sum(a * part for a, part in zip(filters[c], late, strict=True))
+            white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
+            solved, rank = score_statistic(x.T @ x, x.T @ white)
+            gain, freedom = gain + solved / self.noise_power[c], freedom + rank
+        return gain, freedom
+
+    def score_of_larger_model(self, model: Model) -> float:
+        """Return the first-order gain of twice the log likelihood by fitting a larger model."""
+        x = model.start_parameters(self.x, self.model)
+        rows = self._rows_for_model(model)
+        residual = self.residual if rows is self.rows else model.residual_coefficients(x)
+        other = replace(self, rows=rows, residual=residual)
+        return score_statistic(*other.normal_equations(model, x))[0]
+
 
 def fit_model(
-    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_FIT_ITERATIONS
-) -> ModelFit:
+    model: Model,
+    rows: UsedRows,
+    start: Array | None = None,
+    spans: TimeSpans = (),
+    *,
+    steps: int = _MAX_FIT_ITERATIONS,
+) -> State:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
-    filters = np.zeros((6, MAX_NOISE_LAG + 1))
-    filters[:, 0] = 1.0
-    found = ModelFit(
-        model,
-        rows,
-        x,
-        np.zeros(0),
-        model.residual_coefficients(x),
-        filters,
-        np.maximum(both, floor),
-    )
+    white = np.eye(1, MAX_NOISE_LAG + 1).repeat(6, axis=0)
+    residual, power = model.residual_coefficients(x), np.maximum(both, floor)
+    found = State(model, rows, x, np.zeros(0), residual, white, power, spans)
     for step in range(steps):
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
@@ -173,7 +255,7 @@ def fit_model(
         residual = model.residual_coefficients(x)
         order = 0 if step + 1 < _UNWEIGHTED_FIT_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
-        found = ModelFit(model, rows, x, inverse, residual, filters, power)
+        found = State(model, rows, x, inverse, residual, filters, power, spans)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
         if still and step > _UNWEIGHTED_FIT_ITERATIONS:
             break
@@ -188,118 +270,6 @@ def regularized_inverse(gram: Array) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, _RIDGE_OF_SCALED_GRAM)
     return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
-
-
-_NUM_SMOOTH_SEGMENTS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """Model fitted to the rows of a record outside of `contact_spans` (start, stop) [s]."""
-
-    data: Instants
-    contact_spans: TimeSpans
-    fit: ModelFit
-
-    @classmethod
-    def fit_record(
-        cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
-    ) -> State:
-        used = data.used & ~is_in_time_spans(data, spans)
-        rows = UsedRows(data, used, model.step_times, model.columns)
-        return cls(data, spans, fit_model(model, rows, start))
-
-    def refit(self, model: Model, start: Array | None = None, **options: int) -> State:
-        if start is None:
-            start = model.start_parameters(self.x, self.model)
-        return State(
-            self.data,
-            self.contact_spans,
-            fit_model(model, self._rows_for_model(model), start, **options),
-        )
-
-    def _rows_for_model(self, model: Model) -> UsedRows:
-        rows = self.rows
-        if rows.times == model.step_times and np.array_equal(rows.columns, model.columns):
-            return rows
-        return UsedRows(self.data, rows.used, model.step_times, model.columns)
-
-    @property
-    def model(self) -> Model:
-        return self.fit.model
-
-    @property
-    def x(self) -> Array:
-        return self.fit.x
-
-    def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
-        """Return the parameters of a named extension of the model, and their covariance."""
-        where = self.model.parameter_slices[name]
-        return self.x[where], self.fit.covariance[where, where]
-
-    @property
-    def rows(self) -> UsedRows:
-        return self.fit.rows
-
-    @cached_property
-    def likelihood(self) -> float:
-        """Logarithm of the likelihood of all rows; contacts have separate noise."""
-        if not self.contact_spans:
-            return self.fit.likelihood
-        used = self.data.used & ~self.rows.used
-        inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
-        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.noise_power)[1]
-        # Rows at the edges of contacts count as noise of this power, too.
-        every = UsedRows(self.data, self.data.used, (), self.model.columns)
-        count = len(every.rows_with_predecessors) - len(self.rows.rows_with_predecessors)
-        return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
-
-    @cached_property
-    def residual_ratio(self) -> float:
-        """RMS residual over white noise, in the channel where this ratio is largest."""
-        white = np.maximum(self.data.wrench_noise, 1e-12)
-        return float(np.max(self.rows.residual_rms(self.fit.residual) / white))
-
-    @cached_property
-    def smooth_misfit(self) -> float:
-        """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
-        gain, freedom = self.gain_by_smooth_signals
-        return gain / max(1, freedom - self.model.size)
-
-    @cached_property
-    def gain_by_smooth_signals(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
-        y = self.data.y
-        part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
-        columns = np.hstack(
-            [
-                y[:, : OMEGA_PRODUCTS.stop],
-                y[:, ROTATION_SIGNALS] if self.data.gravity_W is not None else y[:, :0],
-                y[:, R_P_PRODUCTS] @ _cable_stiffness_selector().T
-                if self.data.has_positions
-                else y[:, :0],
-                part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
-            ]
-        )
-        e = self.rows.y @ self.fit.residual.T
-        whole, filters = self.rows.rows_with_predecessors, self.fit.noise_filters
-        gain, freedom = 0.0, 0
-        late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
-        for c in range(6):
-            x = sum(a * part for a, part in zip(filters[c], late, strict=True))
-            white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = score_statistic(x.T @ x, x.T @ white)
-            gain, freedom = gain + solved / self.fit.noise_power[c], freedom + rank
-        return gain, freedom
-
-    def score_of_larger_model(self, model: Model) -> float:
-        """Return the first-order gain of twice the log likelihood by fitting a larger model."""
-        x = model.start_parameters(self.x, self.model)
-        rows = self._rows_for_model(model)
-        residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
-        return score_statistic(
-            *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
-        )[0]
 
 
 def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:

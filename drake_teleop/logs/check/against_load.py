@@ -200,19 +200,17 @@ def _edits_with_far_better_fit(
     positive, negative = [], []
     for finding, edited in edits:
         fit = call_or_none_if_unreadable(fitted, edited)
-        if fit is not None and fit.mass > 0:
+        if fit is None:
+            continue
+        if fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif (
-            fit is not None and finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN
-        ):
+        elif finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN:
             negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
-        elif fit is not None and finding is None:  # a clock and the sign
+        elif finding is None:  # a clock and the sign
             negative.append((fit, *next(wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid, decisive = (
-        given.limit_beyond_noise(VALID_UNEXPLAINED),
-        given.unexplained / min_unexplained_reduction_by_edit(given),
-    )
+    valid = given.limit_beyond_noise(VALID_UNEXPLAINED)
+    decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -333,23 +331,14 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     if line is None:
         return [], description
     late, slope = line
-    start = data.start_time_of_stream(stream, description) - data.start_time_of_stream(
-        description.wrench, description
-    )
-    scale = 1.0 / (1.0 + slope)
-    lag = scale * (late + slope * start)
-    offset, factor = stream.time.offset - lag, scale * stream.time.scale
-    edited = edit_field(description, f"{name}.time.offset", offset)
-    edited = edit_field(edited, f"{name}.time.scale", factor)
-    if _unexplained_without_delay(
-        data.read_thinned_log(edited)
-    ) > _MAX_UNEXPLAINED_AFTER_CORRECTION * _unexplained_without_delay(log):
+    _, lines, edited = data.correct_clock_drift(name, description, late, slope)
+    limit = _MAX_UNEXPLAINED_AFTER_CORRECTION * _unexplained_without_delay(log)
+    if _unexplained_without_delay(data.read_thinned_log(edited)) > limit:
         return [], description
     finding = Finding(
         "clock",
         f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against that of the"
-        f" wrench; set {name}.time.offset: {offset:.3f}"
-        f" and {name}.time.scale: {factor:.6f}",
+        f" wrench; set {lines}",
     )
     return [finding], edited
 

@@ -31,9 +31,9 @@ from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_findings
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description, load_description
+from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table, yaml_only_note
 from drake_teleop.logs.read.tables import Table
 
 _MIN_ACCELERATION_AND_SPEED_RMS = 0.3, 0.1
@@ -157,11 +157,9 @@ def check_conventions(
 ) -> Conventions:
     with one_blas_thread():
         found = _check_description(LogData(description, source, dict(tables or {})), description)
-    if Path(source).suffix.lower() not in TABLE_READERS:
-        return found
-    # A canonical table has no description to edit.
-    findings = (replace(f, message=f"{f.message} ({YAML_ONLY_NOTE})") for f in found.findings)
-    return replace(found, findings=tuple(findings))
+    note = yaml_only_note(source)
+    findings = tuple(replace(f, message=f"{f.message}{note}") for f in found.findings)
+    return replace(found, findings=findings)
 
 
 def _is_wrench_constant(log: Log) -> bool:
@@ -178,9 +176,8 @@ def _check_description(data: LogData, description: Description) -> Conventions:
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
-        return Conventions(
-            (*dead, *broken), fit_load(data.read_thinned_log(description)), None, None
-        )
+        fit = fit_load(data.read_thinned_log(description))
+        return Conventions((*dead, *broken), fit, None, None)
     findings, description = correct_gravity_unit(description, log)
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more

@@ -76,18 +76,12 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     ratio = median / float(np.linalg.norm(description.gravity_W))
     for path, sensor in ((path, x) for path, x in sensors.items() if x is not None):
+        read = ratio / description.unit_in_si(sensor.unit)
+        text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in {sensor.unit}"
         for unit in ("m/s^2", "g", "mm/s^2"):
-            if (
-                unit != sensor.unit
-                and 0.7
-                < (ratio / description.unit_in_si(sensor.unit) * description.unit_in_si(unit))
-                < 1.43
-            ):
-                text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in"
-                found = _make_edit(
-                    description, "units", f"{text} {sensor.unit}", {f"{path}.unit": unit}
-                )
-                return [found[0]], found[1]
+            if unit != sensor.unit and 0.7 < read * description.unit_in_si(unit) < 1.43:
+                finding, edited = _make_edit(description, "units", text, {f"{path}.unit": unit})
+                return [finding], edited
     return [], description
 
 
@@ -168,9 +162,8 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     for order in list(permutations(range(3)))[1:]:
         if all(len(names) == 3 for names in columns.values()):
             fields = {path: [names[i] for i in order] for path, names in columns.items()}
-            yield _make_edit(
-                description, "swapped axes", "axes of the wrench are exchanged", fields
-            )
+            text = "axes of the wrench are exchanged"
+            yield _make_edit(description, "swapped axes", text, fields)
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         fields = {f"{stream}.frame": (R @ old).tolist()}

@@ -143,23 +143,18 @@ def _is_template(stream: dict[str, Any]) -> bool:
     return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-class _UnitColumns(NamedTuple):
-    columns: list[str]
-    unit: str
-
-
-_NO_COLUMNS = _UnitColumns([], "")
+_NamesAndUnits = dict[str, tuple[str, str]]
+"""Normalized name and unit of each column, from the column's name."""
+_Columns = dict[str, list[str]]
+"""Names of the columns of each recognized vector."""
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Guess a log description from the names and magnitudes of a table's columns."""
     plain = {name: _split_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= (
-        _find_numbered_columns(plain)
-        | _find_quaternion(table, plain)
-        | _find_array_columns(table, plain)
-    )
+    found |= _find_numbered_columns(plain) | _find_quaternion(table, plain)
+    found |= _find_array_columns(table, plain)
     _torque_to_position(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
@@ -167,31 +162,26 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
-    none = _UnitColumns([_FILL_IN_TEXT] * 3, "")
+    none = [_FILL_IN_TEXT] * 3
     wrench = stream_with_time(
-        **{
-            kind: _draft_quantity(table, kind, found.get(kind, none))
-            for kind in ("force", "torque")
-        },
+        force=_draft_quantity(table, plain, "force", found.get("force", none)),
+        torque=_draft_quantity(table, plain, "torque", found.get("torque", none)),
         sign=1,
     )
-    forces = [
-        _remove_trailing_number(plain[name][0])
-        for name in found.get("force", _NO_COLUMNS).columns[:1]
-    ]
+    forces = [_remove_trailing_number(plain[name][0]) for name in found.get("force", [])[:1]]
     if any(re.search(_BASE_AXES_COLUMN_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench
     imu = {
-        kind: _draft_quantity(table, kind, found[kind])
+        kind: _draft_quantity(table, plain, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if _width_of_columns(table, found.get(kind, _NO_COLUMNS)) == 3
+        if _width_of_columns(table, found.get(kind, [])) == 3
     }
     if imu:
         draft["imu"] = stream_with_time(**imu)
-    pose = _draft_pose(table, found)
+    pose = _draft_pose(table, plain, found)
     if pose:
         draft["pose"] = stream_with_time(**pose)
     if not draft:
@@ -245,7 +235,7 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _numbered_columns(plain: dict[str, tuple[str, str]], pattern: str) -> dict[str, list[str]]:
+def _numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(pattern, words):
@@ -253,21 +243,20 @@ def _numbered_columns(plain: dict[str, tuple[str, str]], pattern: str) -> dict[s
     return groups
 
 
-def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+def _find_vectors(plain: _NamesAndUnits) -> _Columns:
     groups = {
         kind: _group_axes(plain, kind, names) for kind, names in _VECTOR_NAME_PATTERNS.items()
     }
-    found: dict[str, _UnitColumns] = {}
+    found: _Columns = {}
     for pair in _VECTORS_OF_ONE_INSTRUMENT:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
-                columns = groups[kind][name]
-                found[kind] = _UnitColumns(columns, plain[columns[0]][1])
+                found[kind] = groups[kind][name]
     return found
 
 
-def _group_axes(plain: dict[str, tuple[str, str]], kind: str, names: str) -> dict[str, list[str]]:
+def _group_axes(plain: _NamesAndUnits, kind: str, names: str) -> _Columns:
     """Return the columns of each vector of this kind, whole ones if there are any, by its name."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
@@ -292,7 +281,7 @@ def _known_unit(text: str) -> str:
     return _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", text).lower(), "")
 
 
-def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
@@ -300,26 +289,28 @@ def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColu
     for names, axes in _EULER_ANGLE_NAMES.items():
         for group in ends.values():
             if all(name in group for name in names):
-                columns = [group[name] for name in names]
-                return {axes: _UnitColumns(columns, plain[columns[0]][1])}
+                return {axes: [group[name] for name in names]}
     return {}
 
 
-def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[str, str]]) -> None:
-    torque = found.get("torque", _NO_COLUMNS).columns
-    bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
+def _torque_to_position(found: _Columns, plain: _NamesAndUnits) -> None:
+    bare = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])] == [
+        "tx",
+        "ty",
+        "tz",
+    ]
     if bare and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 
-def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
     groups = _numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
             if _are_unit_quaternions(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
-                return {kind: _UnitColumns(quaternion, ""), "position": _UnitColumns(position, "")}
+                return {kind: quaternion, "position": position}
     return {}
 
 
@@ -328,47 +319,44 @@ def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_LENGTH_TOLERANCE)
 
 
-def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+def _find_quaternion(table: Table, plain: _NamesAndUnits) -> _Columns:
     groups = _numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
-    return {"orientation": _UnitColumns(found, "")} if found else {}
+    return {"orientation": found} if found else {}
 
 
-def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+def _find_numbered_columns(plain: _NamesAndUnits) -> _Columns:
     groups = _numbered_columns(plain, r"\d$")
-    found: dict[str, _UnitColumns] = {}
+    found: _Columns = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
             for kind, places in kinds.items():
-                columns = [groups[base][k] for k in places]
-                found[kind] = _UnitColumns(columns, plain[columns[0]][1])
+                found[kind] = [groups[base][k] for k in places]
     by_words = {words: name for name, (words, _) in plain.items()}
     if all(word in by_words for word in _MATRIX_ELEMENT_NAMES):
-        found["matrix"] = _UnitColumns([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
+        found["matrix"] = [by_words[word] for word in _MATRIX_ELEMENT_NAMES]
     return found
 
 
-def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
-    found: dict[str, _UnitColumns] = {}
+def _find_array_columns(table: Table, plain: _NamesAndUnits) -> _Columns:
+    found: _Columns = {}
     arrays = _names_of_array_columns(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
-            words, unit = plain[name]
-            whole = _UnitColumns([name], unit)
-            fits = _width_of_columns(table, whole) == width
-            form = kind
+            words, form = plain[name][0], kind
+            fits = _width_of_columns(table, [name]) == width
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
                 words = words[:-5]
                 form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
             if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
-                found[form] = whole
+                found[form] = [name]
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS_MATRIX_INDICES.items():
-            found[kind] = _UnitColumns([f"{name}[{k}]" for k in places], "")
+            found[kind] = [f"{name}[{k}]" for k in places]
     return found
 
 
@@ -376,21 +364,25 @@ def _names_of_array_columns(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width_of_columns(table: Table, found: _UnitColumns) -> int:
-    return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
+def _width_of_columns(table: Table, columns: list[str]) -> int:
+    return sum(math.prod(table.columns[name].shape[1:]) for name in columns)
 
 
-def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, Any]:
-    group: dict[str, Any] = {"columns": list(found.columns)}
-    if kind in ("force", "torque") and _are_raw_counts(table, found.columns):
+def _draft_quantity(
+    table: Table, plain: _NamesAndUnits, kind: str, columns: list[str]
+) -> dict[str, Any]:
+    group: dict[str, Any] = {"columns": list(columns)}
+    if kind in ("force", "torque") and _are_raw_counts(table, columns):
         group["scale"] = _FILL_IN_TEXT
-    if found.unit:
-        unit = _known_unit(found.unit)
+    if _FILL_IN_TEXT in columns:
+        return group
+    if spelling := plain[columns[0]][1]:
+        unit = _known_unit(spelling)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
-    if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):
+    if kind in ("force", "torque"):
         return group
-    size = np.linalg.norm(np.hstack([table.numbers_with_nan(n, n) for n in found.columns]), axis=1)
+    size = np.linalg.norm(table.numbers_with_nan_side_by_side(columns, columns[0]), axis=1)
     if kind == "specific_force":
         return group | {"unit": "g" if np.nanmedian(size) < 3 else "m/s^2"}
     usual, other, limit = {
@@ -409,27 +401,25 @@ def _are_raw_counts(table: Table, columns: list[str]) -> bool:
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
 
 
-def _draft_pose(table: Table, found: dict[str, _UnitColumns]) -> dict[str, Any]:
-    if _width_of_columns(table, found.get("orientation", _NO_COLUMNS)) == 4:
-        orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
+def _draft_pose(table: Table, plain: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
+    if _width_of_columns(table, found.get("orientation", [])) == 4:
+        orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
-        orientation = {"columns": found[form].columns, "form": form}
+        orientation = {"columns": found[form], "form": form}
     elif euler := next((name for name in found if name in _EULER_ANGLE_NAMES.values()), None):
-        orientation = _draft_quantity(table, "euler", found[euler]) | {
-            "form": "euler",
-            "axes": euler,
-        }
+        orientation = _draft_quantity(table, plain, "euler", found[euler])
+        orientation |= {"form": "euler", "axes": euler}
     elif (name := "rotation_vector") in found:
-        orientation = _draft_quantity(table, name, found[name]) | {"form": name}
+        orientation = _draft_quantity(table, plain, name, found[name]) | {"form": name}
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if _width_of_columns(table, found.get("position", _NO_COLUMNS)) == 3:
-        pose["position"] = _draft_quantity(table, "position", found["position"])
+    if _width_of_columns(table, found.get("position", [])) == 3:
+        pose["position"] = _draft_quantity(table, plain, "position", found["position"])
     return pose
 
 
-def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
+def _draft_time(table: Table, plain: _NamesAndUnits, beside: str) -> dict[str, Any]:
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
@@ -438,12 +428,11 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
         return {"column": _FILL_IN_TEXT}
     if beside in table.columns:
         structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
-        named.sort(
-            key=lambda name: (
-                name.rpartition(".")[0] != structure,
-                len(table.columns[name]) != rows,
-            )
-        )
+
+        def distance(name: str) -> tuple[bool, bool]:
+            return name.rpartition(".")[0] != structure, len(table.columns[name]) != rows
+
+        named.sort(key=distance)
     unit = _UNIT_OF_SPELLING.get(plain[named[0]][1].lower(), "")
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
@@ -456,7 +445,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
     }
 
 
-def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]:
+def _clock_columns(table: Table, plain: _NamesAndUnits) -> list[str]:
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import rotation_matrices, signed_permutations
+from drake_teleop.common.rotations import axis_names, rotation_matrices, signed_permutations
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
     MIN_REDUCTION_BY_EDIT,
@@ -95,26 +95,21 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
     given = _gravity_misfit(few, np.eye(3), gravity)
     if not given > _MIN_WRONG_AXES_MISFIT:
         return None
-    best, P = min(
-        ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
-        key=lambda entry: entry[0],
-    )
+    misfits = ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations())
+    best, P = min(misfits, key=lambda entry: entry[0])
     if _MIN_AXES_MISFIT_REDUCTION * best > given:
         return None
-    order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
     names = imu.angular_velocity.columns
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
-        rows = ", ".join(f"{'-' if P[i, k] < 0 else ''}{'xyz'[k]}" for i, k in enumerate(order))
         return Finding(
             "swapped axes",
-            f"{text}: its x, y, z should be its {rows}; correct imu.angular_velocity.columns, in"
-            " the file where a sign is wrong",
+            f"{text}: its x, y, z should be its {', '.join(axis_names(P))}; correct"
+            " imu.angular_velocity.columns, in the file where a sign is wrong",
         ), None
-    ordered = tuple(names[k] for k in order)
-    return Finding(
-        "swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
-    ), ordered
+    ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
+    text = f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
+    return Finding("swapped axes", text), ordered
 
 
 def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
@@ -127,12 +122,11 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     largest = np.sum(alike * best)
     if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_ALPHA_SHARE * largest:
         return None
-    axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or remove"
-        " it",
+        f" the gyroscope's {', '.join(axis_names(best))}; correct imu.angular_acceleration.columns,"
+        " or remove it",
     )
 
 
@@ -243,44 +237,33 @@ def check_imu_against_pose(
         old = np.eye(3)
         if isinstance(description.imu.frame, tuple):
             old = np.array(description.imu.frame)
-        frame = (
-            np.array(given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI)
-            @ old
-        )
+        R = given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI
+        frame = R @ old
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = (
-            f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S; set imu.frame:"
-            f" {shown}"
-        )
+        text = f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S;"
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
-        findings.append(Finding(kind, text + oblique))
+        findings.append(Finding(kind, f"{text} set imu.frame: {shown}{oblique}"))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
     return findings, given, description
 
 
 def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
-    assert description.imu is not None and description.wrench is not None
-    time = description.imu.time
+    assert description.imu is not None
     if not found.clock_drift:
-        offset = time.offset - found.lag_s
+        offset = description.imu.time.offset - found.lag_s
         finding = Finding(
             "clock",
             f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
             f" set imu.time.offset: {offset:.3f}",
         )
         return finding, edit_field(description, "imu.time.offset", offset)
-    start = data.start_time_of_stream(description.imu, description) - data.start_time_of_stream(
-        description.wrench, description
-    )
-    scale = 1 / (1 + found.clock_drift)
-    lag = scale * (found.mid_record_lag_s + found.clock_drift * (start - found.mid_record_time_s))
-    offset, factor = time.offset - lag, scale * time.scale
+    late = found.mid_record_lag_s - found.clock_drift * found.mid_record_time_s
+    lag, lines, edited = data.correct_clock_drift("imu", description, late, found.clock_drift)
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
         f" {1e3 * found.clock_drift:.3g} ms more each second ({found.lag_s:.3f} s is the best"
-        f" constant); set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
+        f" constant); set {lines}",
     )
-    edited = edit_field(description, "imu.time.offset", offset)
-    return finding, edit_field(edited, "imu.time.scale", factor)
+    return finding, edited

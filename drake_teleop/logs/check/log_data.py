@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.check.corrections import Finding, edit_field
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
@@ -40,10 +40,9 @@ class LogData:
                 tables[stream.source] = read_stream_table(stream)
             steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
         for name, stream in description.streams.items():
-            thin = self._thinned.setdefault(
-                stream.source,
-                replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
-            )
+            whole = tables[stream.source]
+            copied = replace(whole, columns=dict(whole.columns))
+            thin = self._thinned.setdefault(stream.source, copied)
             self._add_thinned_columns(name, stream, thin, min(steps[stream.source]))
 
     def read_whole_log(self, description: Description) -> Log:
@@ -60,8 +59,25 @@ class LogData:
         description = description.model_copy(update=stamped)
         return read_description(description, self._source, tables=self._thinned)
 
-    def start_time_of_stream(self, stream: Any, description: Description) -> float:
-        """Return the time of a stream's first row on the common clock [s]."""
+    def correct_clock_drift(
+        self, name: str, description: Description, late: float, drift: float
+    ) -> tuple[float, str, Description]:
+        """Return a stream's lag at its first row [s], lines to set, and the edited description.
+
+        The clock of stream `name` lags by `late` [s] at the first row of the wrench, and by
+        `drift` [s/s] more each second.
+        """
+        time = getattr(description, name).time
+        start = self._start_time_of_stream(getattr(description, name))
+        start -= self._start_time_of_stream(description.wrench)
+        scale = 1.0 / (1.0 + drift)
+        lag = scale * (late + drift * start)
+        offset, factor = time.offset - lag, scale * time.scale
+        edited = edit_field(description, f"{name}.time.offset", offset)
+        lines = f"{name}.time.offset: {offset:.3f} and {name}.time.scale: {factor:.6f}"
+        return lag, lines, edit_field(edited, f"{name}.time.scale", factor)
+
+    def _start_time_of_stream(self, stream: Any) -> float:
         if stream.time.column is None:
             return float(stream.time.offset)
         return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
@@ -103,9 +119,8 @@ class LogData:
                 x = table.numbers_with_nan(column, field)
                 x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
-                thin.columns[column] = (
-                    taken if field == "orientation" else _means_of_consecutive_rows(x, k)
-                )
+                mean = field != "orientation"
+                thin.columns[column] = _means_of_consecutive_rows(x, k) if mean else taken
 
 
 def _means_of_consecutive_rows(x: Array, k: int) -> Array:
@@ -134,10 +149,8 @@ def channel_findings(
         where = f"{stream}.{field}"
         numbers = _values_by_channel(tables[described.source], quantity.columns, where)
         twice = _repeated_column_findings(where, quantity.columns, named)
-        found += twice or [
-            *_dead_channel_findings(where, numbers),
-            *_equal_channel_findings(where, numbers),
-        ]
+        found += twice or _dead_channel_findings(where, numbers)
+        found += [] if twice else _equal_channel_findings(where, numbers)
     return found
 
 

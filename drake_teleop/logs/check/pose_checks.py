@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import PosesOfLog
@@ -17,6 +16,7 @@ from drake_teleop.logs.read.auto_frames import round_for_yaml
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
+from drake_teleop.logs.read.mounting import lever_matrix
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -62,14 +62,11 @@ def position_findings(description: Description, data: LogData, lag: float) -> li
     g = resample(t, posed.t, posed.gravity)
     by_pose = resample(t, posed.t, posed.specific_force) + g
     s, omega, alpha = (resample(t + lag, sensed.t, x) for x in sensed.motion)
-    turning = np.stack([cross_matrix(w) @ cross_matrix(w) for w in omega])
-    turning += np.stack([cross_matrix(x) for x in alpha])
-    columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
+    columns = np.concatenate([(s + g)[:, :, None], lever_matrix(omega, alpha)], axis=2)
     columns, by_pose = (low_pass(x, sensed.dt, _ACCELERATION_CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
-    fit = _fit_centred_signals(
-        columns[inner], by_pose[inner], 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
-    )
+    independent = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
+    fit = _fit_centred_signals(columns[inner], by_pose[inner], independent)
     if fit is None or abs(fit[0][0]) <= _MIN_ERROR_OVER_DEVIATION * fit[1][0]:
         return []
     x, deviations = fit
@@ -130,11 +127,8 @@ def _fit_centred_signals(
 
 def has_usable_poses(log: Log) -> bool:
     """Return whether a log has poses over at least 4 s, as splines require."""
-    return (
-        log.posed is not None
-        and not log.static
-        and float(log.t[-1] - log.t[0]) >= MIN_POSES_DURATION_S
-    )
+    duration_s = float(log.t[-1] - log.t[0])
+    return log.posed is not None and not log.static and duration_s >= MIN_POSES_DURATION_S
 
 
 def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
@@ -156,14 +150,10 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.parameters.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
-    unit = abs(seen.position_unit_ratio - 1.0) > max(
-        _MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_ratio_std
-    )
-    if (
-        unit
-        or (seen.is_usable and seen.is_mirrored)
-        or _may_torque_unit_be_wrong(phi[1:4] / phi[0], frame.p_SoPo_S)
-    ):
+    limit = max(_MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_ratio_std)
+    if abs(seen.position_unit_ratio - 1.0) > limit or (seen.is_usable and seen.is_mirrored):
+        return None
+    if _may_torque_unit_be_wrong(phi[1:4] / phi[0], frame.p_SoPo_S):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
@@ -179,15 +169,12 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
         deviation = float(frame.rotation_stds_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
         lines.append(f"pose.rotation_in_sensor: {round_for_yaml(frame.R_SP @ posed.R_SP)}")
-    return Finding(
-        "pose frame",
-        f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
-    )
+    text = f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}"
+    return Finding("pose frame", text)
 
 
 def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
-    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS]
-    return not _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M or bool(
-        min(off) < _TORQUE_UNIT_COM_TOLERANCE * size
-    )
+    off = min(np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS)
+    is_usual = _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M
+    return not is_usual or bool(off < _TORQUE_UNIT_COM_TOLERANCE * size)

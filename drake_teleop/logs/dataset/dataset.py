@@ -20,6 +20,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     make_folder,
     output_folder,
+    to_json_data,
     whole_file,
     write_json,
     write_text,
@@ -47,7 +48,6 @@ from drake_teleop.logs.dataset.episode_verdict import (
     find_hypothesis,
     find_offset_step,
     spread_and_centre_of_calm_half,
-    unexplained_reading,
 )
 from drake_teleop.logs.dataset.shared_load import (
     SharedLoad,
@@ -55,8 +55,8 @@ from drake_teleop.logs.dataset.shared_load import (
     load_of_episode,
     samples_for_detector,
 )
-from drake_teleop.logs.figures import summarize_load, to_plain_values
-from drake_teleop.logs.read.alignment import widen_flags
+from drake_teleop.logs.figures import summarize_load
+from drake_teleop.logs.read.alignment import resample, widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
@@ -107,11 +107,8 @@ def dataset_command(
     known = None if load is None else Identification.load(load)
     dataset, copied = open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
-        raise DrakeTeleopError(
-            "the output folder is in the dataset, which must not change",
-            where=str(out),
-            remedy="give another --out",
-        )
+        what = "the output folder is in the dataset, which must not change"
+        raise DrakeTeleopError(what, where=str(out), remedy="give another --out")
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
         streams = _described_or_drafted_streams(dataset, description)
@@ -123,7 +120,7 @@ def dataset_command(
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
-        summary = to_plain_values(_dataset_summary(dataset, copied, shared, rows))
+        summary = to_json_data(_dataset_summary(dataset, copied, shared, rows))
         report = render_page(
             "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
         )
@@ -160,23 +157,20 @@ def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: floa
         return Description.model_validate(data)
     except ValueError as error:
         first = str(error).splitlines()
-        raise DrakeTeleopError(
-            " ".join(first[1:3]).strip() or first[0],
-            where="description",
-            remedy="see docs/robot-learning.md for an example",
-        ) from error
+        what = " ".join(first[1:3]).strip() or first[0]
+        remedy = "see docs/robot-learning.md for an example"
+        raise DrakeTeleopError(what, where="description", remedy=remedy) from error
 
 
 def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
     count = len(dataset.episodes)
     chosen = sorted({0, count // 2, count - 1})[:_MAX_DRAFTED_EPISODES]
-    drafts = [_draft_streams(dataset, dataset.episodes[k]) for k in chosen]
+    episodes = [dataset.episodes[k] for k in chosen]
+    drafts = [_draft_streams(dataset, episode) for episode in episodes]
     texts = Counter(json.dumps(draft, sort_keys=True) for draft in drafts)
     text, votes = texts.most_common(1)[0]
     streams = dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
-    return _choose_quaternion_order_and_sign(
-        dataset, streams, [dataset.episodes[k] for k in chosen]
-    )
+    return _choose_quaternion_order_and_sign(dataset, streams, episodes)
 
 
 def _choose_quaternion_order_and_sign(
@@ -241,13 +235,10 @@ def _remove_file_names(draft: Draft, fps: float) -> dict[str, Any]:
 
 def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
     """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
-    table, described = (
-        dataset.read_episode(episode),
-        _description_of_episode(streams, episode, dataset.fps),
-    )
+    table = dataset.read_episode(episode)
+    described = _description_of_episode(streams, episode, dataset.fps)
     source = f"{episode.file.name}: {episode.name}"
-    tables = {episode.file: table}
-    log = read_description(described, source, tables=tables, differentiate=False)
+    log = read_description(described, source, tables={episode.file: table}, differentiate=False)
     if log.posed is None and log.R_WS is None:
         raise DrakeTeleopError(
             "the episode has no orientation", where=source, remedy="describe pose.orientation"
@@ -274,10 +265,9 @@ def _estimate_shared_load(
     dataset: Dataset, streams: dict[str, Any], known: Identification | None, progress: Any
 ) -> SharedLoad:
     frames = max(np.median([episode.rows for episode in dataset.episodes]), 1)
-    count = np.clip(
-        _MAX_CALIBRATION_ROWS // frames, _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES
-    )
-    step = -(-len(dataset.episodes) // int(count))
+    count = int(_MAX_CALIBRATION_ROWS // frames)
+    count = min(max(count, _MIN_CALIBRATION_EPISODES), _MAX_CALIBRATION_EPISODES)
+    step = -(-len(dataset.episodes) // count)
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
         try:
@@ -319,7 +309,7 @@ def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
     with whole_file(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, np.column_stack(columns))
-    write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
+    write_json(work / f"{number}.json", {"episode": episode.name} | row)
 
 
 def _read_judged_columns(path: Path) -> NewColumns:
@@ -331,11 +321,9 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
     shared = task.shared_load
     log, at = _read_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
-    predict = signals.reading_predictor(shared.phi)
-    found = find_hypothesis(
-        predict, signals.regressor_at_lag, shared.lag_frames, shared.usual_half_widths
+    found, residual = find_hypothesis(
+        signals, shared.phi, shared.lag_frames, shared.usual_half_widths
     )
-    residual = unexplained_reading(found, predict, signals.regressor_at_lag)
     faults: list[EpisodeFault] = saturation_faults(log.wrench)
     faults += name_faults(found, shared.lag_frames, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
@@ -346,15 +334,14 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
-    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * shared.usual_half_widths)[
-        0
-    ] - np.log(shared.usual_half_widths)
+    usual = shared.usual_half_widths
+    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0] - np.log(usual)
     spread -= np.log(found.force_torque_gains).repeat(3)
     if not faults and spread.mean() > _MAX_UNEXPLAINED_LOG_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
-    rows = np.array([np.interp(at, log.t, x) for x in contact.T]).T
+    rows = resample(at, log.t, contact)
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)
     free = contact[~touched]
     row = {

@@ -9,7 +9,7 @@ import copy
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import (
+    array_columns,
     numeric_and_nested_columns,
     numeric_column_names,
     read_table,
@@ -67,13 +68,11 @@ class Dataset(NamedTuple):
         rows = slice(episode.first_row, episode.first_row + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
             if self.kind == "hdf5":
-                return Table(
-                    episode.file,
-                    _with_element_columns(read_hdf5(episode.file, group=episode.group)),
-                )
+                arrays = read_hdf5(episode.file, group=episode.group)
+                return Table(episode.file, array_columns(arrays, None))
             if self.kind == "zarr":
                 arrays = read_zarr(episode.file / "data", rows=rows)
-                return Table(episode.file, _with_element_columns(arrays))
+                return Table(episode.file, array_columns(arrays, None))
             frame = _read_numeric_columns(episode.file, episode.file.stat().st_mtime_ns)
             part = frame.slice(episode.first_row, episode.rows)
             return Table(episode.file, numeric_and_nested_columns(part))
@@ -86,15 +85,6 @@ def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
 
     frame = pl.scan_parquet(file)
     return frame.select(numeric_column_names(frame)).collect().lazy()
-
-
-def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    parts = {
-        f"{name}[{k}]": x.reshape(len(x), -1)[:, k]
-        for name, x in arrays.items()
-        for k in range(int(np.prod(x.shape[1:])) if 1 < x.ndim <= 3 else 0)
-    }
-    return parts | dict(arrays)
 
 
 def open_dataset(path: Path) -> Dataset:
@@ -233,11 +223,8 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
     head = first - 2
     if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
-        raise DrakeTeleopError(
-            "columns can only be added to a file with a header and one line for each row",
-            where=str(path),
-            remedy="convert it to Parquet",
-        )
+        what = "columns can only be added to a file with a header and one line for each row"
+        raise DrakeTeleopError(what, where=str(path), remedy="convert it to Parquet")
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
     names = [f"{CONTACT_WRENCH_COLUMN}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT_COLUMN]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
@@ -252,6 +239,13 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
         temporary.write_bytes(b"".join(lines))
 
 
+def _arrays_of_columns(new: NewColumns) -> list[tuple[str, NDArray]]:
+    return [
+        ("contact_wrench", new.contact_wrench.astype(np.float32)),
+        ("in_contact", new.in_contact.astype(bool)),
+    ]
+
+
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
     h5py = import_optional_module("h5py", dataset.path)
     make_folder(out.parent)
@@ -261,18 +255,17 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> N
             for episode, new in zip(dataset.episodes, columns, strict=True):
                 group = file[episode.group]
                 group = group.get("obs", group)
-                for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
+                for name, values in _arrays_of_columns(new):
                     if name in group:
                         del group[name]
-                    group[name] = values.astype(np.float32 if values.ndim == 2 else bool)
+                    group[name] = values
 
 
 def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
     zarr = import_optional_module("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
-    for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
-        array = values.astype(np.float32 if values.ndim == 2 else bool)
-        group.create_array(name, data=array, overwrite=True)
+    for name, values in _arrays_of_columns(new):
+        group.create_array(name, data=values, overwrite=True)
     if (out / ".zmetadata").is_file():
         zarr.consolidate_metadata(out, zarr_format=2)
 
@@ -289,16 +282,11 @@ def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewCol
     write_text(target / "info.json", json.dumps(info, indent=4, ensure_ascii=False))
     if not (source / "stats.json").is_file():
         return
-    stats, new = (
-        json.loads((source / "stats.json").read_text(encoding="utf-8")),
-        _join_columns(columns),
-    )
+    stats = json.loads((source / "stats.json").read_text(encoding="utf-8"))
+    new = _join_columns(columns)
     with_quantiles = any("q50" in x for x in stats.values())
-    for name, values in (
-        (CONTACT_WRENCH_COLUMN, new.contact_wrench),
-        (IN_CONTACT_COLUMN, new.in_contact[:, None]),
-    ):
-        x = values.astype(float)
+    for name, values in zip((CONTACT_WRENCH_COLUMN, IN_CONTACT_COLUMN), new, strict=True):
+        x = values.astype(float).reshape(len(values), -1)
         parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
         if with_quantiles:
             parts |= {key: np.quantile(x, q, axis=0) for key, q in _LEROBOT_QUANTILES.items()}

@@ -8,9 +8,9 @@ the frames, so that contact has no influence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from drake_teleop.common.numeric import Array, narrowest_half_interval
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSplines
+from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
 LAG_STEPS_PER_FRAME = 8
@@ -39,11 +40,6 @@ _MIN_HALF_WIDTH_OVER_TYPICAL = 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
 _MAX_DEVIATION_OVER_NOISE = 1.5
-
-PredictReading = Callable[[str, float], tuple[Array, Array]]
-"""Function of a kind and a lag [frames]: reading in the axes of S, and the load's wrench (N, 6)."""
-RegressorAtLag = Callable[[float], Array]
-"""Function of a lag [frames] that returns the regressor V (N, 6, 10)."""
 
 
 @dataclass(frozen=True)
@@ -98,64 +94,57 @@ def spread_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array
 
 
 def find_hypothesis(
-    predict: PredictReading, regress: RegressorAtLag, usual_lag: float, typical: Array
-) -> Hypothesis:
-    """Return the simplest hypothesis that explains the wrench of an episode.
+    signals: EpisodeSignals, phi: Array, usual_lag: float, typical: Array
+) -> tuple[Hypothesis, Array]:
+    """Return the simplest hypothesis that explains the wrench of an episode, and its residual.
+
+    The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain.
 
     Args:
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _MIN_HALF_WIDTH_OVER_TYPICAL * typical)
+    search = HypothesisSearch(signals, phi, usual_lag, _MIN_HALF_WIDTH_OVER_TYPICAL * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
-        return usual
+        return usual, search.unexplained_reading(usual)
     found = [usual]
     for kind in HYPOTHESIS_KINDS:
-        lags = {
-            usual_lag,
-            search.best_lag(replace(usual, kind=kind)),
-            search.lag_of_linear_fit(kind),
-        }
-        for lag in lags:
+        best_lag = search.best_lag(replace(usual, kind=kind))
+        for lag in {usual_lag, best_lag, search.lag_of_linear_fit(kind)}:
             found += search._hypotheses_at_lag(kind, lag)
             found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
         found.append(search.with_spread_and_cost(replace(best, lag=search.best_lag(best))))
-    return min(found, key=lambda x: x.cost)
-
-
-def unexplained_reading(x: Hypothesis, predict: PredictReading, regress: RegressorAtLag) -> Array:
-    """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
-    wrench, load_wrench = predict(x.kind, x.lag)
-    if x.phi is not None:
-        return np.asarray(wrench - regress(x.lag) @ x.phi)
-    return wrench - x.reading_of_load(load_wrench)
+    best = min(found, key=lambda x: x.cost)
+    return best, search.unexplained_reading(best)
 
 
 class HypothesisSearch:
     """Search for the best hypothesis of an episode; `floor` (6,) is the least half width."""
 
-    def __init__(
-        self, predict: PredictReading, regress: RegressorAtLag, usual_lag: float, floor: Array
-    ) -> None:
-        self.predict, self.regress = predict, regress
-        self.usual_lag, self.floor = usual_lag, floor
-        self.frames = len(predict("sensor", usual_lag)[0])
+    def __init__(self, signals: EpisodeSignals, phi: Array, usual_lag: float, floor: Array) -> None:
+        self.predict = lru_cache(maxsize=None)(partial(signals.predict_reading, phi))
+        self.regress = signals.regressor_at_lag
+        self.usual_lag, self.floor, self.frames = usual_lag, floor, len(signals.log)
         self.price = _SPREAD_COST_PER_FAULT + _SPREAD_COST_TIMES_FRAMES / self.frames
 
-    def _reading_residual(self, x: Hypothesis) -> Array:
-        return unexplained_reading(x, self.predict, self.regress)
+    def unexplained_reading(self, x: Hypothesis) -> Array:
+        """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
+        wrench, load_wrench = self.predict(x.kind, x.lag)
+        if x.phi is not None:
+            return np.asarray(wrench - self.regress(x.lag) @ x.phi)
+        return wrench - x.reading_of_load(load_wrench)
 
     def with_spread_and_cost(self, x: Hypothesis) -> Hypothesis:
-        spread, offsets = spread_and_centre_of_calm_half(self._reading_residual(x), self.floor)
+        spread, offsets = spread_and_centre_of_calm_half(self.unexplained_reading(x), self.floor)
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
     def _best_rows_of(self, x: Hypothesis) -> NDArray[np.bool_]:
         return _rows_of_smallest_residual(
-            (self._reading_residual(x) - x.offsets) / np.exp(x.spread)
+            (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
         )
 
     def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
@@ -187,9 +176,8 @@ class HypothesisSearch:
         """Return the signed permutation (3, 3) with which p fits three channels of w best."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
-        spread = spread_and_centre_of_calm_half(pairs.reshape(len(w), -1), np.repeat(floor, 6))[
-            0
-        ].reshape(3, 3, 2)
+        pairs = pairs.reshape(len(w), -1)
+        spread = spread_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0].reshape(3, 3, 2)
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
             for M in _SIGNED_PERMUTATIONS
@@ -327,9 +315,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
-    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (
-        np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL
-    )
+    change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
+    noise = change / (np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL)
     deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_DEVIATION_OVER_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
@@ -343,10 +330,8 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEP_FRAMES]:
         if not fewest <= k <= n - fewest:
             continue
-        (first, before), (second, after) = (
-            inliers_and_centre(residual[:k]),
-            inliers_and_centre(residual[k:]),
-        )
+        first, before = inliers_and_centre(residual[:k])
+        second, after = inliers_and_centre(residual[k:])
         gain = int(first.sum() + second.sum() - whole)
         sharp = first[-2:].all() and second[:2].all()
         full = min(first.mean(), second.mean()) > 0.4
@@ -384,22 +369,16 @@ class EpisodeSignals:
             poses = log.posed.poses
             spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_POSE_KNOT_SPACING_S)
             self._splines = PoseSplines(poses, spacing, smooth=True)
-        grid = (
-            np.arange(
-                -_MOTION_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,
-                (len(log) + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME,
-            )
-            / LAG_STEPS_PER_FRAME
-        )
-        self._fine = self.motion(log.t[0] + grid * log.dt)
+        margin = _MOTION_MARGIN_FRAMES * LAG_STEPS_PER_FRAME
+        steps = np.arange(-margin, len(log) * LAG_STEPS_PER_FRAME + margin)
+        self._fine = self.motion(log.t[0] + steps / LAG_STEPS_PER_FRAME * log.dt)
 
     def motion(self, t: Array) -> Motion:
         log = self.log
         if self._splines is None or log.posed is None:
             assert log.gravity is not None and log.R_WS is not None
             signals = (*log.motion, log.gravity, log.R_WS.reshape(-1, 9))
-            at = (np.array([np.interp(t, log.t, x) for x in y.T]).T for y in signals)
-            s, omega, alpha, gravity, R = at
+            s, omega, alpha, gravity, R = (resample(t, log.t, x) for x in signals)
             return Motion(s, omega, alpha, gravity, R.reshape(-1, 3, 3))
         g = log.posed.gravity_W
         R = rotation_matrices(self._splines.quaternion(t), "quaternion_wxyz")
@@ -407,11 +386,9 @@ class EpisodeSignals:
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) `lag` frames after each frame."""
-        step = round((lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME)
-        if (
-            abs(step - (lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME) < 1e-6
-            and abs(lag) < _MOTION_MARGIN_FRAMES
-        ):
+        first = (lag + _MOTION_MARGIN_FRAMES) * LAG_STEPS_PER_FRAME
+        step = round(first)
+        if abs(step - first) < 1e-6 and abs(lag) < _MOTION_MARGIN_FRAMES:
             rows = slice(step, step + LAG_STEPS_PER_FRAME * len(self.log), LAG_STEPS_PER_FRAME)
             return Motion(*(x[rows] for x in self._fine))
         return self.motion(self.log.t + lag * self.log.dt)
@@ -419,20 +396,13 @@ class EpisodeSignals:
     def regressor_at_lag(self, lag: float) -> Array:
         return regressor(*self.motion_at_lag(lag)[:3])
 
-    def reading_predictor(self, phi: Array) -> PredictReading:
-        """Return a function that predicts the reading from load phi (10,) under a hypothesis.
+    def predict_reading(self, phi: Array, kind: str, lag: float) -> tuple[Array, Array]:
+        """Return the measured wrench (N, 6) in the axes of S, and that of load phi (10,).
 
-        It takes the hypothesis (`HYPOTHESIS_KINDS`) and the lag [frames], and returns the measured
-        wrench in the axes of S and the predicted one.
+        `kind` is one of `HYPOTHESIS_KINDS`, `lag` the delay of the motion [frames].
         """
-
-        @cache
-        def predict_reading(kind: str, lag: float) -> tuple[Array, Array]:
-            at = self.motion_at_lag(lag)
-            s = at.s + at.gravity if kind == "weight removed" else at.s
-            wrench = self.log.wrench
-            if kind == "base":
-                wrench = (wrench.reshape(-1, 2, 3) @ at.R_WS).reshape(-1, 6)
-            return wrench, non_contact_wrench(s, at.omega, at.alpha, phi)
-
-        return predict_reading
+        at, wrench = self.motion_at_lag(lag), self.log.wrench
+        s = at.s + at.gravity if kind == "weight removed" else at.s
+        if kind == "base":
+            wrench = (wrench.reshape(-1, 2, 3) @ at.R_WS).reshape(-1, 6)
+        return wrench, non_contact_wrench(s, at.omega, at.alpha, phi)

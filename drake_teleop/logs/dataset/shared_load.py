@@ -21,9 +21,9 @@ from drake_teleop.logs.dataset.episode_verdict import (
     Hypothesis,
     HypothesisSearch,
     hypothesis_without_fault,
-    unexplained_reading,
 )
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 
 _MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
@@ -63,17 +63,15 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
-            raise DrakeTeleopError(
-                "the fitted mass is negative in all episodes",
-                where="dataset",
-                remedy="set wrench.sign: -1 in a --description",
-            )
-        phi = min(
-            candidates,
-            key=lambda phi: (
-                _excess_log_spread(episodes, own, phi).clip(max=_MAX_COUNTED_EXCESS_SPREAD).sum()
-            ),
-        )
+            what = "the fitted mass is negative in all episodes"
+            remedy = "set wrench.sign: -1 in a --description"
+            raise DrakeTeleopError(what, where="dataset", remedy=remedy)
+
+        def counted_excess(phi: Array) -> float:
+            excess = _excess_log_spread(episodes, own, phi)
+            return float(excess.clip(max=_MAX_COUNTED_EXCESS_SPREAD).sum())
+
+        phi = min(candidates, key=counted_excess)
         for _ in range(2):
             members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
             members = members if members.any() else np.ones(len(own), bool)
@@ -85,14 +83,13 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     phi = load.phi if determined else usable_phi(load)[0]
     members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
-    usual = [_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
-    lag = (
-        round(float(np.median([x.lag for x in usual])) * LAG_STEPS_PER_FRAME) / LAG_STEPS_PER_FRAME
-    )
-    typical = np.exp(np.median([x.spread for x in usual], axis=0))
+    usual = [_hypothesis_and_residual(episodes[k], phi, own[k].lag) for k in chosen]
+    steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
+    lag = round(steps) / LAG_STEPS_PER_FRAME
+    typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
     free = [
-        _contact_free_samples(episodes[k], x, phi, typical)
-        for k, x in zip(chosen, usual, strict=True)
+        _contact_free_samples(episodes[k], x.lag, residual - x.offsets, typical)
+        for k, (x, residual) in zip(chosen, usual, strict=True)
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
@@ -102,37 +99,29 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
 def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
     """Return the load that explains an episode best, and its lag."""
-    search = HypothesisSearch(
-        signals.reading_predictor(np.zeros(10)),
-        signals.regressor_at_lag,
-        0.0,
-        _MIN_RESIDUAL_HALF_WIDTH,
-    )
+    search = HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
-    return min(
-        (search.hypothesis_of_other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum()
-    )
+    found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
+    return min(found, key=lambda x: x.spread.sum())
 
 
 def _excess_log_spread(
     episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
 ) -> Array:
-    usual = [
-        _hypothesis_at_best_lag(s, phi, x.lag).spread.sum()
-        for s, x in zip(episodes, own, strict=True)
-    ]
+    pairs = zip(episodes, own, strict=True)
+    usual = [_hypothesis_and_residual(s, phi, x.lag)[0].spread.sum() for s, x in pairs]
     return np.array(usual) - [x.spread.sum() for x in own]
 
 
-def _hypothesis_at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
-    search = HypothesisSearch(
-        signals.reading_predictor(phi), signals.regressor_at_lag, near, _MIN_RESIDUAL_HALF_WIDTH
-    )
+def _hypothesis_and_residual(
+    signals: EpisodeSignals, phi: Array, near: float
+) -> tuple[Hypothesis, Array]:
+    """Return the hypothesis without fault at the best lag near one [frames], and its residual."""
+    search = HypothesisSearch(signals, phi, near, _MIN_RESIDUAL_HALF_WIDTH)
     lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
-    return min(
-        (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags),
-        key=lambda x: x.spread.sum(),
-    )
+    found = (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags)
+    best = min(found, key=lambda x: x.spread.sum())
+    return best, search.unexplained_reading(best)
 
 
 def _fit_load_to_members(
@@ -144,8 +133,7 @@ def _fit_load_to_members(
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
     for k in (int(row) for row in np.flatnonzero(members)):
-        x = _hypothesis_at_best_lag(episodes[k], phi, own[k].lag)
-        r = unexplained_reading(x, episodes[k].reading_predictor(phi), episodes[k].regressor_at_lag)
+        x, r = _hypothesis_and_residual(episodes[k], phi, own[k].lag)
         sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episodes[k].regressor_at_lag(x.lag)[rows], episodes[k].log.wrench[rows]
@@ -181,14 +169,12 @@ def _fit_load_to_members(
 
 
 def _contact_free_samples(
-    signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array
+    signals: EpisodeSignals, lag: float, contact: Array, typical: Array
 ) -> DetectorSamples:
-    residual = (
-        unexplained_reading(x, signals.reading_predictor(phi), signals.regressor_at_lag) - x.offsets
-    )
-    far = (np.abs(residual) > _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
-    near = np.convolve(far, np.ones(2 * _CONTACT_MARGIN_FRAMES + 1), "same") > 0.5
-    return samples_for_detector(signals, x.lag, residual).select_rows(~near)
+    limit = _MIN_CONTACT_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL
+    far = np.asarray((np.abs(contact) > limit).any(axis=1))
+    near = widen_flags(far, _CONTACT_MARGIN_FRAMES)
+    return samples_for_detector(signals, lag, contact).select_rows(~near)
 
 
 def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:

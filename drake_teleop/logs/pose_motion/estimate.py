@@ -170,14 +170,8 @@ def estimate_from_poses(
         window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
         spectra = window.spectra_at_delay(splines, late)
         Z = spectra.second_moments()
-        Q = noise_moments(
-            splines,
-            grid,
-            spectra.taper,
-            spectra.motion_signals,
-            spectra.bands,
-            splines.estimate_pose_noise(),
-        )
+        signals = spectra.taper, spectra.motion_signals, spectra.bands
+        Q = noise_moments(splines, grid, *signals, splines.estimate_pose_noise())
         levels = fit_noise_levels(Z, spectra.bands)
         best = fit_linear_model(Z, levels)
 
@@ -255,11 +249,8 @@ def _find_splines_and_delay(
             f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
             remedy="record both at the same time, longer, without interruptions",
         )
-    top = min(
-        MAX_FREQUENCY_HZ,
-        _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * poses.rate,
-        _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * grid.stride / grid.dt,
-    )
+    slower = min(poses.rate, grid.stride / grid.dt)
+    top = min(MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
     rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
@@ -271,9 +262,8 @@ def _find_splines_and_delay(
     part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
     rate = 0.0 if known else estimate_clock_rate_error(part, cache, late, spacing)
     if rate:
-        near_poses, poses = (
-            correct_clock_rate(x, rate, part.grid, late) for x in (near_poses, poses)
-        )
+        near_poses = correct_clock_rate(near_poses, rate, part.grid, late)
+        poses = correct_clock_rate(poses, rate, part.grid, late)
         cache = splines_of_averaged_poses(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
@@ -290,9 +280,8 @@ def _find_splines_and_delay(
 
 
 def _select_poses_near_grid(poses: Poses, grid: WrenchGrid) -> Poses:
-    inside = (poses.t >= grid.t[0] - 2 * DELAY_SEARCH_HALF_RANGE_S) & (
-        poses.t <= grid.t[-1] + 2 * DELAY_SEARCH_HALF_RANGE_S
-    )
+    margin = 2 * DELAY_SEARCH_HALF_RANGE_S
+    inside = (poses.t >= grid.t[0] - margin) & (poses.t <= grid.t[-1] + margin)
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
@@ -341,9 +330,8 @@ def _initial_parameters_with_free_frame(
     if not turned:
         return fit.parameters
     R = seen.R_SP.T
-    return RigidParameters(
-        np.zeros(16), fit.parameters.delay_s, R @ start.R_PS.T @ start.p_PoSo_P, R
-    )
+    origin = R @ start.R_PS.T @ start.p_PoSo_P
+    return RigidParameters(np.zeros(16), fit.parameters.delay_s, origin, R)
 
 
 def _pose_frame_of_fit(free: RigidFit, start: RigidParameters) -> PoseFrame:

@@ -114,10 +114,8 @@ def _fit_sensor_model(
         tau += shift
         if abs(tau) > _MAX_IMU_SHIFT_S:
             return None
-    if (
-        np.abs(D).max() > _MAX_GAIN_ERROR
-        or residual[1:].sum() > _MAX_RESIDUAL_OVER_MOTION_POWER * (np.abs(X[1:]) ** 2).sum()
-    ):
+    limit = _MAX_RESIDUAL_OVER_MOTION_POWER * (np.abs(X[1:]) ** 2).sum()
+    if np.abs(D).max() > _MAX_GAIN_ERROR or residual[1:].sum() > limit:
         return None
     return _ImuSensorModel(D, b, tau, power)
 

@@ -211,9 +211,8 @@ class Spectra:
     def costs_at_delays(self, delays: Array) -> Array:
         """Return the negative log likelihoods (D,) of fits with delays (D,) [s]."""
         if self.is_taper_fixed:
-            Z = np.array(
-                [second_moments(x.signals, x.wrench, x.bands) for x in map(self.with_delay, delays)]
-            )
+            late = map(self.with_delay, delays)
+            Z = np.array([second_moments(x.signals, x.wrench, x.bands) for x in late])
             zz, zf, _ = _moments_of_signals_and_wrench(Z)
         else:
             zz, zf = self._delayed_moments(np.asarray(delays))
@@ -328,24 +327,21 @@ def choose_knot_spacing(
 
     Knots are 8 or 16 % closer than at the highest likelihood. The delay is not changed if `known`.
     """
-    start = window.spectra_at_delay(
-        choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0]), delay
-    )
+    coarsest = choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0])
+    start = window.spectra_at_delay(coarsest, delay)
+
+    def cost_and_spacing(cache: SplineCache, h: float) -> tuple[float, float]:
+        splines = cache.splines_with_spacing(h)
+        return start.with_motion(splines, window.gravity_W, delay).fit_coefficients().cost, h
+
     found = []
     for cache in choices:
         spacings = _knot_spacings_for_pose_rate(cache)
-
-        def cost(h: float, cache: SplineCache = cache) -> float:
-            return (
-                start.with_motion(cache.splines_with_spacing(h), window.gravity_W, delay)
-                .fit_coefficients()
-                .cost
-            )
-
-        costs = [(cost(h), h) for h in spacings]
-        middle = min(costs)[1]
-        between = [float(np.sqrt(middle * h)) for h in _adjacent_knot_spacings(middle, spacings)]
-        found.append(min(costs + [(cost(h), h) for h in between]))
+        costs = [cost_and_spacing(cache, h) for h in spacings]
+        k = spacings.index(min(costs)[1])
+        beside = spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]
+        between = [float(np.sqrt(spacings[k] * h)) for h in beside]
+        found.append(min(costs + [cost_and_spacing(cache, h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
     finer = _SPACING_OVER_BEST if window.grid.known_load is None else _SPACING_OVER_BEST_KNOWN_LOAD
@@ -361,15 +357,9 @@ def splines_of_averaged_poses(poses: Poses) -> SplineCache:
     return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _MIN_POSES_PER_S + 1e-6))))
 
 
-def _adjacent_knot_spacings(h: float, spacings: list[float]) -> list[float]:
-    k = spacings.index(h)
-    return spacings[max(0, k - 1) : k] + spacings[k + 1 : k + 2]
-
-
 def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
-    return [h for h in TRIED_KNOT_SPACINGS_S if h * cache.rate >= MIN_POSES_PER_KNOT] or [
-        TRIED_KNOT_SPACINGS_S[0]
-    ]
+    usable = [h for h in TRIED_KNOT_SPACINGS_S if h * cache.rate >= MIN_POSES_PER_KNOT]
+    return usable or [TRIED_KNOT_SPACINGS_S[0]]
 
 
 _MAX_CLOCK_RATE_ITERATIONS, _MIN_CLOCK_RATE_LIKELIHOOD_GAIN = 3, 25.0
@@ -416,9 +406,8 @@ def _clock_rate_and_delay_step(spectra: Spectra) -> tuple[float, float]:
     moves = [signal_spectrum(grid, spectra.taper, x, count) for x in (from_middle * change, change)]
     gram, right = np.zeros((2, 2)), np.zeros(2)
     for c, C in enumerate(fit.coefficients):
-        weight = np.sqrt(
-            spectra.bands.frequency_weight / fit.noise_power[spectra.bands.band_of_frequency, c]
-        )[:, None]
+        power = fit.noise_power[spectra.bands.band_of_frequency, c]
+        weight = np.sqrt(spectra.bands.frequency_weight / power)[:, None]
         columns = np.column_stack([free, *(x @ C for x in moves)])
         left = (spectra.wrench[:, c] - spectra.signals @ C)[:, None]
         y = (np.hstack([columns, left]) * weight).view(np.float64).reshape(count, -1, 2)

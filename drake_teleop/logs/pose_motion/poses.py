@@ -74,12 +74,8 @@ class ImuData:
         def means_of_consecutive(x: Array | None) -> Array | None:
             return None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
 
-        means_t = at.mean(axis=1)[whole]
-        return ImuData(
-            means_t,
-            means_of_consecutive(self.specific_force),
-            means_of_consecutive(self.angular_velocity),
-        )
+        both = map(means_of_consecutive, (self.specific_force, self.angular_velocity))
+        return ImuData(at.mean(axis=1)[whole], *both)
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,9 +73,8 @@ def _max_residuals_over_std(x: Array, y: Array, weights: Array, inside: NDArray[
     residual = np.abs(y - x @ C)
     scale = _STD_PER_NORMAL_MAD * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    return np.asarray(
-        (residual / np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)).max(axis=1)
-    )
+    scale = np.maximum(scale, MIN_NOISE_STD_OVER_WRENCH_RMS * rms + 1e-30)
+    return np.asarray((residual / scale).max(axis=1))
 
 
 def _std_growth_by_rejection(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
@@ -83,8 +82,7 @@ def _std_growth_by_rejection(x: Array, inside: NDArray[np.bool_], kept: NDArray[
         return np.inf
     whole, left = (x[rows].T @ x[rows] for rows in (inside, kept))
     # pinv returns zeros for motions that no kept sample contains, hence the share of the whole.
-    every, some = (
-        np.diag(np.linalg.pinv(G, rcond=1e-12, hermitian=True))
-        for G in (whole, left + 1e-6 * whole)
-    )
+    grams = np.array([whole, left + 1e-6 * whole])
+    inverses = np.linalg.pinv(grams, rcond=1e-12, hermitian=True)
+    every, some = np.diagonal(inverses, axis1=1, axis2=2)
     return float(np.sqrt(np.max(some / every) * kept.sum() / inside.sum()))

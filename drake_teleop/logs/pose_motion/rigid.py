@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import GAIN_ERROR_TORQUE_ARM_M, parameter_errors_by_gains
-from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
+from drake_teleop.load.identification import mark_undetermined
+from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, min_noise_power
 from drake_teleop.logs.pose_motion.spectra import (
     NUM_MOMENT_SIGNALS,
@@ -230,9 +231,7 @@ def _parameter_covariance(
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
         larger = covariance * np.outer(scale, scale)
-    larger[undetermined], larger[:, undetermined] = 0.0, 0.0
-    larger[undetermined, undetermined] = np.inf
-    return larger
+    return mark_undetermined(larger, undetermined)
 
 
 def _std_factors_of_estimated_weights(record: _FitData, solution: _RigidSolution) -> Array:

@@ -11,7 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.moments import omega_product_jacobians
+from drake_teleop.load.normal_equations import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
     NUM_MOTION_SIGNALS,
     PoseSplines,
@@ -115,9 +115,8 @@ def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> Frequenc
     last = group == group[-1]
     if weight[last].sum() < _MIN_NOISE_GROUP_SIZE and not last.all():
         group[last] = group[~last][-1]
-    narrow = np.log(np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]) // np.log(
-        _MAX_NARROW_BAND_EDGE_RATIO
-    )
+    low = np.clip(frequency, frequency[1], _NARROW_BANDS_TO_HZ) / frequency[1]
+    narrow = np.log(low) // np.log(_MAX_NARROW_BAND_EDGE_RATIO)
     first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
     group = np.unique(group[first], return_inverse=True)[1]
     return FrequencyBands(frequency, np.cumsum(first) - 1, weight, group)
@@ -182,11 +181,8 @@ def taper_derivative(grid: WrenchGrid, taper: Array) -> Array:
 
 
 def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complexfloating]) -> Array:
-    return np.asarray(
-        np.fft.irfft(np.fft.rfft(x, grid.transform_length) * response, grid.transform_length)[
-            : len(x)
-        ]
-    )
+    n = grid.transform_length
+    return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * response, n)[: len(x)])
 
 
 def second_moments(
@@ -240,14 +236,10 @@ class NoiseLevels:
         """
         remaining = self.sums_over_groups(self.band_sizes)[:, None]
         if used is not None:
-            remaining = np.maximum(
-                remaining - 0.5 * self.sums_over_groups(used),
-                _MIN_REMAINING_DOF_SHARE * remaining,
-            )
-        level = (
-            np.add.reduceat(sums / self.relative_power, self._first_bands_of_groups, axis=-2)
-            / remaining
-        )
+            left = remaining - 0.5 * self.sums_over_groups(used)
+            remaining = np.maximum(left, _MIN_REMAINING_DOF_SHARE * remaining)
+        white = sums / self.relative_power
+        level = np.add.reduceat(white, self._first_bands_of_groups, axis=-2) / remaining
         return np.asarray(level[..., self.group_of_band, :] * self.relative_power)
 
     def sums_over_groups(self, x: Array) -> Array:
@@ -297,19 +289,14 @@ def noise_moments(
     eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
     parts = [
-        (position_power * w2**2, eye),
-        (rotation_power, still),
-        (rotation_power * w2, first + second),
+        *((position_power * w2**2, eye), (rotation_power, still)),
+        *((rotation_power * w2, first + second), (rotation_power * w2**2, third)),
     ]
-    parts.append((rotation_power * w2**2, third))
     Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
+    signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
     for power, shape in parts:
-        Q[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS] += (
-            bands.sums_over_bands(power)[:, None, None] * shape
-        )
-        Q[:, SIGNAL_RATE_COLUMNS, SIGNAL_RATE_COLUMNS] += (
-            bands.sums_over_bands(power * w2)[:, None, None] * shape
-        )
+        Q[:, signals, signals] += bands.sums_over_bands(power)[:, None, None] * shape
+        Q[:, rates, rates] += bands.sums_over_bands(power * w2)[:, None, None] * shape
     return Q
 
 

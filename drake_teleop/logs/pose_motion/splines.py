@@ -131,9 +131,8 @@ class PoseSplines:
             band, side = gram, right[:, part]
             if rows is not None:
                 weight = pose * self.rate / (own * imu_rows.rate)
-                more, other = _normal_equations_of_rates(
-                    shifted_t[inside], rows[inside], knots, order
-                )
+                at, x = shifted_t[inside], rows[inside]
+                more, other = _normal_equations_of_rates(at, x, knots, order)
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), SPLINE_DEGREE)
@@ -253,17 +252,14 @@ class PoseSplines:
     def estimate_pose_noise(self) -> tuple[float, float]:
         """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""
         if self.imu_rows is not None:
-            position_power, rotation_power = self.imu_rows.pose_noise_powers
-            return float(np.sqrt(position_power * self.rate)), float(
-                np.sqrt(rotation_power * self.rate)
-            )
+            stds = np.sqrt(np.array(self.imu_rows.pose_noise_powers) * self.rate)
+            return float(stds[0]), float(stds[1])
         sums, count = np.zeros(2), 0
         for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
-            turn = 2.0 * _vector_part_of_relative_quaternion(
-                fitted[:, 3:], self.poses.quaternion[part]
-            )
+            measured = self.poses.quaternion[part]
+            turn = 2.0 * _vector_part_of_relative_quaternion(fitted[:, 3:], measured)
             powers = self._powers_in_noise_band(position), self._powers_in_noise_band(turn)
             sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
         position_std, rotation_std = np.sqrt(sums / count)
@@ -304,15 +300,12 @@ def noise_share_passed_by_splines(frequency: Array, spacing: float) -> Array:
 
 def _place_knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
-    if with_imu:
-        return np.concatenate(
-            [np.repeat(t[0], SPLINE_DEGREE + 1), inner, np.repeat(t[-1], SPLINE_DEGREE + 1)]
-        )
-    before = np.searchsorted(t, inner)
-    first = np.unique(before, return_index=True)[1]
-    inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
-    ends = np.repeat(t[[0, -1]], SPLINE_DEGREE + 1)
-    return np.concatenate([ends[: SPLINE_DEGREE + 1], inner, ends[SPLINE_DEGREE + 1 :]])
+    if not with_imu:
+        before = np.searchsorted(t, inner)
+        first = np.unique(before, return_index=True)[1]
+        inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
+    start, stop = (np.repeat(end, SPLINE_DEGREE + 1) for end in t[[0, -1]])
+    return np.concatenate([start, inner, stop])
 
 
 def _remove_knots_without_poses(knots: Array, t: Array) -> Array:

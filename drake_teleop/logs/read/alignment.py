@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,13 +156,8 @@ def low_pass_log(log: Log, cutoff_hz: float | None) -> Log:
     """Return the log with zero-phase filtered wrench and motion; unchanged for static poses."""
     if log.static:
         return log
-    return replace(
-        log,
-        wrench=low_pass(log.wrench, log.dt, cutoff_hz),
-        specific_force=low_pass(log.specific_force, log.dt, cutoff_hz),
-        angular_velocity=low_pass(log.angular_velocity, log.dt, cutoff_hz),
-        angular_acceleration=low_pass(log.angular_acceleration, log.dt, cutoff_hz),
-    )
+    wrench, *motion = (low_pass(x, log.dt, cutoff_hz) for x in (log.wrench, *log.motion))
+    return log.with_motion(*motion, wrench=wrench)
 
 
 def remove_delay(log: Log, delay_s: float) -> Log:
@@ -178,7 +173,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
             where=log.source,
             remedy="give a shorter delay, or `auto`",
         )
-    s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
+    motion = (resample(at[known], log.t, x) for x in log.motion)
     gravity, R_WS = (
         None if x is None else resample(at[known], log.t, x) for x in (log.gravity, log.R_WS)
     )
@@ -187,15 +182,8 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         # A gap can belong to the wrench or to the motion, so both positions are flagged.
         moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
         bridged = log.bridged[known] | moved
-    return replace(
-        log.select_rows(known),
-        specific_force=s,
-        angular_velocity=omega,
-        angular_acceleration=alpha,
-        gravity=gravity,
-        R_WS=R_WS,
-        bridged=bridged,
-    )
+    advanced: dict[str, Any] = {"gravity": gravity, "R_WS": R_WS, "bridged": bridged}
+    return log.select_rows(known).with_motion(*motion, **advanced)
 
 
 def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:

@@ -74,11 +74,9 @@ def import_optional_module(name: str, path: Path) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise DrakeTeleopError(
-            f"reading {path.suffix} files requires the Python package {name}",
-            where=str(path),
-            remedy=remedy_to_install_extra("formats"),
-        ) from None
+        what = f"reading {path.suffix} files requires the Python package {name}"
+        remedy = remedy_to_install_extra("formats")
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy) from None
 
 
 _MAT_HEADER_BYTES = 128

@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.logs.causes.cause import direction_std_deg
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
@@ -72,11 +73,8 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
         remedy = "turn the sensor about two axes, by more than 30 deg"
     else:
         return mounting
-    raise DrakeTeleopError(
-        f"the data do not determine the rotation of the IMU: {problem}",
-        where=where,
-        remedy=f"{remedy}, or give a rotation matrix",
-    )
+    what = f"the data do not determine the rotation of the IMU: {problem}"
+    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or give a rotation matrix")
 
 
 def _unexplained_shares_text(found: Mounting) -> str:
@@ -107,11 +105,8 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
     if mounting is not None and mounting.fits_pose:
         lever = mounting.lever_arm
     if lever is None or not lever.is_determined_by_axis.all():
-        other = lever_arm_from_wrench(at_Io)
-        if lever is None or (
-            other and other.is_determined_by_axis.sum() > lever.is_determined_by_axis.sum()
-        ):
-            lever = other
+        arms = [arm for arm in (lever, lever_arm_from_wrench(at_Io)) if arm is not None]
+        lever = max(arms, key=lambda arm: int(arm.is_determined_by_axis.sum()), default=None)
     if lever is None:
         raise DrakeTeleopError(
             "the data do not determine the position of the accelerometer: no position of"
@@ -120,12 +115,9 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, at_Io: Log, where:
             remedy="give imu.position in metres, or pose.position",
         )
     if not lever.is_determined_by_axis.all():
-        axes = ", ".join(
-            a for a, known in zip("xyz", lever.is_determined_by_axis, strict=True) if not known
-        )
         raise DrakeTeleopError(
-            f"the motion does not determine {axes} of the accelerometer's position"
-            f" ({_format_arm_mm(lever)} mm, from the {lever.source})",
+            f"the motion does not determine {_unknown_axes(lever.is_determined_by_axis)} of the"
+            f" accelerometer's position ({_format_arm_mm(lever)} mm, from the {lever.source})",
             where=where,
             remedy="turn faster, about more axes, or give imu.position in metres",
         )
@@ -155,15 +147,8 @@ def estimate_auto_pose_frame(
     alone = {"imu": None, "pose": pose.model_copy(update=plain)}
     log = read(description.model_copy(update=alone))
     assert log.posed is not None
-    found = estimate_from_poses(
-        log.t,
-        log.wrench,
-        log.posed.poses,
-        log.posed.gravity_W,
-        p_SoPo_S=None,
-        R_SP=None,
-        lost=log.bridged,
-    )
+    arrays = log.t, log.wrench, log.posed.poses, log.posed.gravity_W
+    found = estimate_from_poses(*arrays, p_SoPo_S=None, R_SP=None, lost=log.bridged)
     frame = found.frame
     changes: dict[str, Any] = {}
     notes: list[str] = []
@@ -186,12 +171,13 @@ def estimate_auto_pose_frame(
 
 def _require_determined_axes(known: Any, where: str, quantity: str) -> None:
     if not known.all():
-        axes = ", ".join(a for a, deviation in zip("xyz", known, strict=True) if not deviation)
-        raise DrakeTeleopError(
-            f"the data do not determine {quantity} {axes}",
-            where=where,
-            remedy="turn the sensor faster, about more axes, without contact; or give the values",
-        )
+        what = f"the data do not determine {quantity} {_unknown_axes(known)}"
+        remedy = "turn the sensor faster, about more axes, without contact; or give the values"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
+
+
+def _unknown_axes(known: Any) -> str:
+    return ", ".join(axis for axis, is_known in zip("xyz", known, strict=True) if not is_known)
 
 
 def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
@@ -220,14 +206,9 @@ def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     The delay is estimated from `motion_log`, the same log with motion, and removed.
     """
     assert motion_log.gravity is not None
-    at = np.clip(
-        log.t + delay_of_free_fit(block_means_of_log(motion_log)), motion_log.t[0], motion_log.t[-1]
-    )
-    return replace(
-        log,
-        wrench=log.wrench
-        + wrench_of_weight(weight, resample(at, motion_log.t, motion_log.gravity)),
-    )
+    at = log.t + delay_of_free_fit(block_means_of_log(motion_log))
+    gravity = resample(at.clip(*motion_log.t[[0, -1]]), motion_log.t, motion_log.gravity)
+    return replace(log, wrench=log.wrench + wrench_of_weight(weight, gravity))
 
 
 _MAX_GRAVITY_DIRECTION_STD_DEG = 2.0
@@ -239,24 +220,20 @@ def estimate_auto_gravity(
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
-    explanation = explain_misfit(
-        block_means_of_log(log),
-        lambda delay_s: block_means_of_log(remove_delay(log, delay_s)),
-        ("gravity",),
-    )
+
+    def instants_at_delay(delay_s: float) -> Instants:
+        return block_means_of_log(remove_delay(log, delay_s))
+
+    explanation = explain_misfit(block_means_of_log(log), instants_at_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
         change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
-        across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
-        spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
-        deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
+        deviation = direction_std_deg(estimated, covariance)
     if not deviation < _MAX_GRAVITY_DIRECTION_STD_DEG:
-        raise DrakeTeleopError(
-            "the data do not determine the direction of gravity",
-            where=f"{source}:gravity",
-            remedy="record the load in more orientations, without contact; or give the vector",
-        )
+        what = "the data do not determine the direction of gravity"
+        remedy = "record the load in more orientations, without contact; or give the vector"
+        raise DrakeTeleopError(what, where=f"{source}:gravity", remedy=remedy)
     gravity = tuple(round_for_yaml(estimated))
     note = (
         f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"

@@ -36,16 +36,11 @@ _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _UNPACKED_BYTES_MARGIN = 6, 200, 100_000_000
 _MAX_ADDED_PROCESS_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE_MESSAGE = "its uncompressed size is too large"
 _CUT_REMEDY = "cut it, or write the topics one by one"
-_VECTOR_MESSAGE_FIELDS = (
-    "force",
-    "torque",
-    "linear_acceleration",
-    "angular_velocity",
-    "orientation",
-    "position",
-)
-_VECTOR_OF_MESSAGE_FIELD = {name: name for name in _VECTOR_MESSAGE_FIELDS}
-_VECTOR_OF_MESSAGE_FIELD |= {"rotation": "orientation", "translation": "position"}
+_VECTOR_OF_MESSAGE_FIELD = {
+    **{name: name for name in ("force", "torque", "linear_acceleration", "angular_velocity")},
+    **{name: "orientation" for name in ("orientation", "rotation")},
+    **{name: "position" for name in ("position", "translation")},
+}
 _MESSAGE_TYPES_OF_STREAM = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -88,11 +83,9 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
             known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
-            raise DrakeTeleopError(
-                f"the bag has no topic {topic!r}",
-                where=str(path),
-                remedy=f"its topics are {', '.join(known)}",
-            )
+            what = f"the bag has no topic {topic!r}"
+            remedy = f"its topics are {', '.join(known)}"
+            raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
@@ -157,20 +150,15 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
-        raise DrakeTeleopError(
-            "the path is not a bag",
-            where=str(path),
-            remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
-        )
+        remedy = "give a folder with metadata.yaml, or a .mcap, .db3 or .bag file"
+        raise DrakeTeleopError("the path is not a bag", where=str(path), remedy=remedy)
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise DrakeTeleopError(
-            "reading bags requires the Python package rosbags, which is not installed",
-            where=str(path),
-            remedy=remedy_to_install_extra("ros"),
-        ) from error
+        what = "reading bags requires the Python package rosbags, which is not installed"
+        remedy = remedy_to_install_extra("ros")
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy) from error
     try:
         for file in path.iterdir() if path.is_dir() else [path]:
             if file.suffix.lower() == ".mcap":
@@ -185,11 +173,9 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise DrakeTeleopError(
-            f"the bag cannot be read: {text}",
-            where=str(path),
-            remedy="check it with `ros2 bag info`",
-        ) from error
+        what = f"the bag cannot be read: {text}"
+        remedy = "check it with `ros2 bag info`"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy) from error
 
 
 def _check_unpacked_size(path: Path) -> None:
@@ -239,11 +225,8 @@ def _read_column_blocks(
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
         named = ", ".join(sorted(filter(None, children)))
         what = f"no child frame {child_frame!r}" if child_frame else "several child frames"
-        raise DrakeTeleopError(
-            f"has {what}",
-            where=where,
-            remedy=f"give child_frame, one of {named}" if named else "leave it out",
-        )
+        remedy = f"give child_frame, one of {named}" if named else "leave it out"
+        raise DrakeTeleopError(f"has {what}", where=where, remedy=remedy)
     return blocks
 
 

@@ -99,23 +99,16 @@ class Log:
             if value is None:
                 continue
             if np.shape(value) != shape:
-                raise DrakeTeleopError(
-                    f"has shape {np.shape(value)} instead of {shape}",
-                    where=f"{self.source}:{name}",
-                    remedy="give one row per time",
-                )
+                what = f"has shape {np.shape(value)} instead of {shape}"
+                remedy = "give one row per time"
+                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
             if not np.isfinite(value).all():
-                raise DrakeTeleopError(
-                    "holds NaN or infinity (numbers must be finite)",
-                    where=f"{self.source}:{name}",
-                    remedy="cut or repair these samples",
-                )
+                what = "holds NaN or infinity (numbers must be finite)"
+                remedy = "cut or repair these samples"
+                raise DrakeTeleopError(what, where=f"{self.source}:{name}", remedy=remedy)
         if np.any(np.diff(self.t) <= 0):
-            raise DrakeTeleopError(
-                "does not increase",
-                where=f"{self.source}:t",
-                remedy="sort the rows, and remove repeated times",
-            )
+            remedy = "sort the rows, and remove repeated times"
+            raise DrakeTeleopError("does not increase", where=f"{self.source}:t", remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -144,6 +137,10 @@ class Log:
         selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
         return replace(self, **selected)
 
+    def with_motion(self, s: Array, omega: Array, alpha: Array, **changes: Any) -> Log:
+        changes |= {"specific_force": s, "angular_velocity": omega, "angular_acceleration": alpha}
+        return replace(self, **changes)
+
     @property
     def motion(self) -> tuple[Array, Array, Array]:
         return self.specific_force, self.angular_velocity, self.angular_acceleration
@@ -154,20 +151,13 @@ def write_log(log: Log, path: str | Path) -> None:
     import polars as pl
 
     path = Path(path)
-    names = (
-        *WRENCH_COLUMNS,
-        *SPECIFIC_FORCE_COLUMNS,
-        *ANGULAR_VELOCITY_COLUMNS,
-        *ANGULAR_ACCELERATION_COLUMNS,
-    )
+    names = [*WRENCH_COLUMNS, *SPECIFIC_FORCE_COLUMNS]
+    names += [*ANGULAR_VELOCITY_COLUMNS, *ANGULAR_ACCELERATION_COLUMNS]
     values = np.hstack([log.wrench, *log.motion])
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
-        raise DrakeTeleopError(
-            f"logs cannot be written in the format {path.suffix!r}",
-            where=str(path),
-            remedy="name it .csv or .parquet",
-        )
+        what = f"logs cannot be written in the format {path.suffix!r}"
+        raise DrakeTeleopError(what, where=str(path), remedy="name it .csv or .parquet")
     write_table(path, frame)
 
 
@@ -185,11 +175,9 @@ def describe_canonical(path: Path, table: Table) -> Description:
         return bool(found)
 
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
-        raise DrakeTeleopError(
-            "is not a canonical log: it has none of the columns t, f_x ... tau_z",
-            where=str(path),
-            remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
-        )
+        what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"
+        remedy = "describe it in a YAML file; `drake-teleop inspect` drafts one"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     table.finite_numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
         name: {"columns": names}
@@ -208,11 +196,9 @@ def describe_canonical(path: Path, table: Table) -> Description:
         return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})
     if "orientation" not in fields and not {"specific_force", "angular_velocity"} <= fields.keys():
         missing = ANGULAR_VELOCITY_COLUMNS if "specific_force" in fields else SPECIFIC_FORCE_COLUMNS
-        raise DrakeTeleopError(
-            f"a wrench without kinematics: no columns {' '.join(missing)}",
-            where=str(path),
-            remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
-        )
+        what = f"a wrench without kinematics: no columns {' '.join(missing)}"
+        remedy = "add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     table.numbers_with_nan("t", str(path))
     stream = {"file": path, "time": {"column": "t"}}
     streams: dict[str, Any] = {"wrench": wrench | stream}

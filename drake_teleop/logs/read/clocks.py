@@ -102,11 +102,8 @@ def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Arra
         if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
             whole.finite_numbers([name], 1, f"{where}.column")
     if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
-        raise DrakeTeleopError(
-            "the column holds dates or times of day, which have no unit",
-            where=f"{where}.unit",
-            remedy="leave `unit` out",
-        )
+        what = "the column holds dates or times of day, which have no unit"
+        raise DrakeTeleopError(what, where=f"{where}.unit", remedy="leave `unit` out")
     columns = whole.numbers_with_nan_side_by_side(names, f"{where}.column")
     t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
@@ -227,22 +224,17 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
             remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
         )
     if len(t) > 1 and t[0] == t[-1]:
-        raise DrakeTeleopError(
-            f"the time stamps of {table.path.name} never increase",
-            where=where,
-            remedy="name another column, or give time.rate",
-        )
+        what = f"the time stamps of {table.path.name} never increase"
+        raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
 
 
 def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
         row = table.line_in_file(rows[int(np.argmax(steps <= 0))])
-        raise DrakeTeleopError(
-            f"the time stamps do not increase around row {row} of {table.path.name}",
-            where=where,
-            remedy="cut the log there, or give time.rate instead of the stamps",
-        )
+        what = f"the time stamps do not increase around row {row} of {table.path.name}"
+        remedy = "cut the log there, or give time.rate instead of the stamps"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _check_rate_is_plausible(t: Array, time: Time, where: str) -> None:

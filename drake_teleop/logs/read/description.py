@@ -45,7 +45,6 @@ from drake_teleop.logs.read.description_fields import (
     Weight,
 )
 
-YAML_ONLY_NOTE = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY_M_S2 = 100.0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,40 +116,26 @@ MIN_SINGULAR_VALUE_RATIO = 1e-5
 _MAX_RESIDUAL_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def nonlinear_least_squares(
-    residual: Callable[[Array], Array], x: Array, linear: Array | None = None
-) -> tuple[Array, Array]:
+def nonlinear_least_squares(residual: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
-    `residual` maps x to residuals (N, 3 k). `linear` (N, 3 k, m) are constant derivatives by the
-    last m parameters.
+    `residual` maps x to residuals (N, 3 k), with one weight for each three channels.
     """
-    linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
-    rows, channels, _ = linear.shape
-    found = _minimize_residual(residual, x, linear)
-    found = _minimize_residual(residual, found.x, linear)  # with updated weights
-    width = channels * (rows // _NUM_JACKKNIFE_BLOCKS)
-    return found.x, jackknife_deviations(found.jac, found.fun, width)
+    from scipy.optimize import least_squares
 
-
-def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
-    from scipy.optimize import approx_fprime, least_squares
-
-    errors, others = residual(x), len(x) - linear.shape[2]
-    power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
-    sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
-    known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
-
-    def weighted_residual(z: Array) -> Array:
+    def weighted_residual(z: Array, sigma: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
-    def jacobian(z: Array) -> Array:
-        found = approx_fprime(z[:others], lambda y: weighted_residual(np.append(y, z[others:])))
-        return np.hstack([found, known])
-
-    return least_squares(
-        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_RESIDUAL_EVALUATIONS
-    )
+    for _ in range(2):  # then with updated weights
+        errors = residual(x)
+        power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
+        sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
+        found = least_squares(
+            weighted_residual, x, x_scale="jac", max_nfev=_MAX_RESIDUAL_EVALUATIONS, args=(sigma,)
+        )
+        x = found.x
+    width = errors.shape[1] * (len(errors) // _NUM_JACKKNIFE_BLOCKS)
+    return x, jackknife_deviations(found.jac, found.fun, width)
 
 
 def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
@@ -321,16 +306,13 @@ class Mounting:
     @property
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
-        omega_agrees = (
-            self.unexplained_omega is None or self.unexplained_omega < MAX_UNEXPLAINED_SHARE
-        )
+        omega = self.unexplained_omega
+        if self.is_mirrored or (omega is not None and omega >= MAX_UNEXPLAINED_SHARE):
+            return False
         if self.lever_arm is not None:
-            return (
-                not self.is_mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
-            )
+            return self.unexplained < MAX_UNEXPLAINED_SHARE
         # Without positions the pose determines the angular velocity, but not the acceleration.
-        known = self.unexplained_omega is not None or self.unexplained < MAX_SHARE_WITHOUT_POSITIONS
-        return not self.is_mirrored and omega_agrees and known
+        return omega is not None or self.unexplained < MAX_SHARE_WITHOUT_POSITIONS
 
     @property
     def is_determined(self) -> bool:
@@ -402,13 +384,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
 
 
 def _refine_rotation_and_lag(
-    t: Array,
-    drift_lag: Array,
-    t_imu: Array,
-    pairs: list[tuple[Array, Array]],
-    K: Array,
-    R: Array,
-    lag: float,
+    t: Array, drift_lag: Array, t_imu: Array, pairs: SignalPairs, K: Array, R: Array, lag: float
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
@@ -422,10 +398,7 @@ def _refine_rotation_and_lag(
     first = np.zeros(7 + 3 * len(pairs))
     first[3] = lag
     first[7:] = -pose_residual(first).mean(axis=0)
-    linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
-    linear[:, :3, :3] = -K
-    linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = nonlinear_least_squares(pose_residual, first, linear)
+    x, deviations = nonlinear_least_squares(pose_residual, first)
     return x, deviations, pose_residual(x)
 
 

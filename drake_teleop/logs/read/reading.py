@@ -38,7 +38,6 @@ from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
-    YAML_ONLY_NOTE,
     Description,
     Imu,
     Pose,
@@ -57,7 +56,12 @@ from drake_teleop.logs.read.streams import (
     specific_force_at_So,
     uniform_times_of_streams,
 )
-from drake_teleop.logs.read.table_files import TABLE_READERS, read_table, require_file
+from drake_teleop.logs.read.table_files import (
+    TABLE_READERS,
+    read_table,
+    require_file,
+    yaml_only_note,
+)
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES = 3
@@ -86,11 +90,9 @@ def read_log(
     """
     expect_type((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_BANDWIDTH_HZ:
-        raise DrakeTeleopError(
-            f"{bandwidth_hz:g} Hz is too low",
-            where="bandwidth_hz",
-            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one",
-        )
+        what = f"{bandwidth_hz:g} Hz is too low"
+        remedy = f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one"
+        raise DrakeTeleopError(what, where="bandwidth_hz", remedy=remedy)
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
         reader = _LogReader(load_description(path), str(path), bandwidth_hz)
@@ -103,11 +105,8 @@ def read_log(
     if is_bag(path):
         raise missing_topic_error(path)
     require_file(path)
-    raise DrakeTeleopError(
-        f"format {path.suffix!r} is not known",
-        where=str(path),
-        remedy=f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)",
-    )
+    remedy = f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)"
+    raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
 
 
 def read_description(
@@ -169,9 +168,8 @@ class _LogReader:
         log = replace(log, gain_std=gain_std, estimated=free, described=self._description)
         if pose is not None and pose.recorded_poses is not None:
             inertial = None if imu is None else imu.imu_data
-            log = replace(
-                log, posed=self._description.poses_with_frame(pose.recorded_poses, inertial)
-            )
+            posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
+            log = replace(log, posed=posed)
         log = log if keep_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
@@ -213,8 +211,7 @@ class _LogReader:
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
-        is_table = Path(self._source).suffix.lower() in TABLE_READERS
-        of_table = f" ({YAML_ONLY_NOTE})" if is_table else ""
+        of_table = yaml_only_note(self._source)
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -240,22 +237,15 @@ class _LogReader:
         if position is not None:
             position = resample(t, clock.t, position)
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
-        return Stream(
-            "pose",
-            t,
-            rotate_world_to_S(R_WS, acceleration - self._description.gravity_W),
-            *angular_motion(R_WS, dt, self._bandwidth_hz),
-            R_WS,
-            raw,
-        )
+        s = rotate_world_to_S(R_WS, acceleration - self._description.gravity_W)
+        return Stream("pose", t, s, *angular_motion(R_WS, dt, self._bandwidth_hz), R_WS, raw)
 
     def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._read_vectors(
-                "pose", "position", stream.position, table, clock.num_rows
-            )
+            quantity = "pose", "position", stream.position
+            position = self._read_vectors(*quantity, table, clock.num_rows)
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
         orientations = OrientationColumns(self._description, form, table, clock.num_rows, where)
@@ -315,11 +305,8 @@ class _LogReader:
     def _no_orientation_error(
         self, name: str, remedy: str = "add a pose stream"
     ) -> DrakeTeleopError:
-        return DrakeTeleopError(
-            "vectors in the axes of the base cannot be rotated to S without an orientation",
-            where=f"{self._source}:{name}.frame",
-            remedy=remedy,
-        )
+        what = "vectors in the axes of the base cannot be rotated to S without an orientation"
+        return DrakeTeleopError(what, where=f"{self._source}:{name}.frame", remedy=remedy)
 
     def _read_static_poses(self, stream: Static) -> Log:
         table = self._table_of_stream(stream)
@@ -373,11 +360,9 @@ class _LogReader:
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
         if len(t) < MIN_STREAM_SAMPLES or len(uniform_times(t)) < MIN_STREAM_SAMPLES:
-            raise DrakeTeleopError(
-                f"{len(t)} samples in {table.path.name} are too few",
-                where=f"{self._source}:{name}",
-                remedy=f"record at least {MIN_STREAM_SAMPLES}, evenly spaced",
-            )
+            what = f"{len(t)} samples in {table.path.name} are too few"
+            remedy = f"record at least {MIN_STREAM_SAMPLES}, evenly spaced"
+            raise DrakeTeleopError(what, where=f"{self._source}:{name}", remedy=remedy)
         self._notes += [f"{name}: {note}" for note in clock.notes]
         if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
             self._notes.append(
@@ -448,9 +433,6 @@ class _LogReader:
         for start, stop in np.concatenate(self._gaps):
             flags[slice(*np.searchsorted(t, [start, stop]))] = True
         if (~flags).sum() < MIN_STREAM_SAMPLES:
-            raise DrakeTeleopError(
-                f"only {int((~flags).sum())} samples are outside of gaps",
-                where=self._source,
-                remedy="record without interruptions",
-            )
+            what = f"only {int((~flags).sum())} samples are outside of gaps"
+            raise DrakeTeleopError(what, where=self._source, remedy="record without interruptions")
         return flags

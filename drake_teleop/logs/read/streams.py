@@ -137,11 +137,9 @@ class OrientationColumns:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
-            raise DrakeTeleopError(
-                f"row {row} of {self._table.path.name} is not a rotation or unit quaternion",
-                where=self._where,
-                remedy=f"check the columns and their order; form is {self._orientation.form}",
-            )
+            what = f"row {row} of {self._table.path.name} is not a rotation or unit quaternion"
+            remedy = f"check the columns and their order; form is {self._orientation.form}"
+            raise DrakeTeleopError(what, where=self._where, remedy=remedy)
 
 
 def uniform_times_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
@@ -153,20 +151,16 @@ def uniform_times_of_streams(wrench_t: Array, streams: Sequence[Stream], source:
         for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
     )
     if stop <= start:
-        raise DrakeTeleopError(
-            f"the streams do not overlap in time ({spans})",
-            where=source,
-            remedy="check time.unit of each stream, or shift its clock by time.offset",
-        )
+        what = f"the streams do not overlap in time ({spans})"
+        remedy = "check time.unit of each stream, or shift its clock by time.offset"
+        raise DrakeTeleopError(what, where=source, remedy=remedy)
     uniform = uniform_times(wrench_t)
     dt = mean_time_step(uniform)
     # Rounding of the clocks must not exclude the first and last sample.
     inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
     t = uniform[inside]
     if len(t) < MIN_STREAM_SAMPLES:
-        raise DrakeTeleopError(
-            f"the streams have only {len(t)} samples in common ({spans})",
-            where=source,
-            remedy=f"record at least {MIN_STREAM_SAMPLES}, or check time.offset",
-        )
+        what = f"the streams have only {len(t)} samples in common ({spans})"
+        remedy = f"record at least {MIN_STREAM_SAMPLES}, or check time.offset"
+        raise DrakeTeleopError(what, where=source, remedy=remedy)
     return t

@@ -35,6 +35,13 @@ _MAX_CELLS_IN_MEMORY = 2**24
 """Number of cells above which columns of a Parquet file are read on access."""
 
 
+def yaml_only_note(source: str) -> str:
+    """Return a note on lines of a description for the log of a canonical table, otherwise ""."""
+    if Path(source).suffix.lower() not in TABLE_READERS:
+        return ""
+    return " (in a log description of this table; the canonical form has no such line)"
+
+
 def read_table(path: Path, *, header: bool = True) -> Table:
     """Read a file with a suffix in `TABLE_READERS`; raise an error if it is invalid.
 
@@ -188,14 +195,16 @@ def _to_numpy(series: pl.Series) -> NDArray:
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
-def array_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return arrays (N, ...) by name as columns, and their elements as `name[k]`."""
+def array_columns(
+    arrays: Mapping[str, NDArray], most: int | None = _MAX_ELEMENT_COLUMNS
+) -> dict[str, NDArray]:
+    """Return arrays (N, ...) by name as columns, and their first `most` elements as `name[k]`."""
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
-        f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
+        f"{name}[{k}]": column
         for name, array in arrays.items()
-        for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
-        if k < _MAX_ELEMENT_COLUMNS
+        for k, column in enumerate(array.reshape(len(array), -1).T[:most])
+        if 1 < array.ndim <= 3
     }
     return parts | arrays
 

@@ -75,34 +75,26 @@ class Table:
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
             rows = len(column) if rows is None else rows
-            self._check_row_counts([name], [column], where, rows)
+            self._check_row_count(name, column, where, rows)
             out = out if found else np.empty((rows, width))
             found += column.shape[1]
             if found <= width:
                 out[:, found - column.shape[1] : found] = column
         if found != width:
-            raise DrakeTeleopError(
-                f"lists {found} columns, but {width} are needed",
-                where=where,
-                remedy=f"list {width} columns of {self.path.name}",
-            )
+            what = f"lists {found} columns, but {width} are needed"
+            remedy = f"list {width} columns of {self.path.name}"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         return out
 
-    def _check_row_counts(
-        self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
-    ) -> None:
-        rows = len(columns[0]) if columns and rows is None else rows
-        for name, column in zip(names, columns, strict=True):
-            if len(column) != rows:
-                raise DrakeTeleopError(
-                    f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed",
-                    where=where,
-                    remedy="name columns that belong together",
-                )
+    def _check_row_count(self, name: str | int, column: NDArray, where: str, rows: int) -> None:
+        if len(column) != rows:
+            what = f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed"
+            raise DrakeTeleopError(what, where=where, remedy="name columns that belong together")
 
     def numbers_with_nan_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
         columns = [self.numbers_with_nan(name, where) for name in names]
-        self._check_row_counts(names, columns, where, None)
+        for name, column in zip(names, columns, strict=True):
+            self._check_row_count(name, column, where, len(columns[0]))
         return np.hstack(columns)
 
     def numbers_with_nan(self, name: str | int, where: str) -> Array:
@@ -152,18 +144,14 @@ class Table:
     def _finite_column(self, name: str, where: str) -> Array:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent_groups:
-                raise DrakeTeleopError(
-                    f"{self.path.name} marks {name!r} as not provided (covariance -1)",
-                    where=where,
-                    remedy="name another column, or remove this field",
-                )
+                what = f"{self.path.name} marks {name!r} as not provided (covariance -1)"
+                remedy = "name another column, or remove this field"
+                raise DrakeTeleopError(what, where=where, remedy=remedy)
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
-            raise DrakeTeleopError(
-                f"{self.path.name} has no column {name!r}",
-                where=where,
-                remedy=f"{hint} {_join_names(similar or list(self.columns))}",
-            )
+            what = f"{self.path.name} has no column {name!r}"
+            remedy = f"{hint} {_join_names(similar or list(self.columns))}"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         numbers = self.numbers_with_nan(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
@@ -177,16 +165,11 @@ class Table:
         return numbers
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
-        return DrakeTeleopError(
-            f"{cell!r} in row {self.line_in_file(row)} is not a number",
-            where=f"{self.path}:{name}",
-            remedy="correct the cell or delete the row"
-            + (
-                ", for example a row of units, which belong into the log description"
-                if row == 0
-                else ""
-            ),
-        )
+        what = f"{cell!r} in row {self.line_in_file(row)} is not a number"
+        remedy = "correct the cell or delete the row"
+        if row == 0:
+            remedy += ", for example a row of units, which belong into the log description"
+        return DrakeTeleopError(what, where=f"{self.path}:{name}", remedy=remedy)
 
 
 def decimal_resolution(values: Array) -> float:
