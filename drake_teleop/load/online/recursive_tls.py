@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, finite_array
+from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.normal_equations import regressor_coefficients
 from drake_teleop.load.online.recursive import (
@@ -332,13 +331,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         prior_std: ArrayLike = PRIOR_STD,
         bound: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
-        self._motion_std = finite_array("motion_std", motion_std, 9)
-        if (self._motion_std < 0.0).any():
-            raise DrakeTeleopError(
-                f"has the negative value {self._motion_std.min():g}",
-                where="motion_std",
-                remedy="give standard deviations of 0 or more",
-            )
+        self._motion_std = nonnegative_array("motion_std", motion_std, 9)
         super().__init__(noise_std, forgetting, prior_std, bound)
 
     @classmethod
