@@ -34,7 +34,7 @@ UP = (0.0, 0.0, 1.0)
 #: Here a vertical force on the stylus moves the inner link alone.
 DECOUPLED = [0.215, 0.0, -0.17]
 OMEGA = 2 * np.pi * np.geomspace(1.0, 30.0, 25)
-#: A servo that is where it is told to be after two periods, and rests there.
+#: A servo that reaches its command after two periods and rests there.
 DEADBEAT = {
     "joint_control__position_bandwidth_hz": 1 / (1.5 * PERIOD) / (2 * np.pi),
     "joint_control__velocity_bandwidth_hz": 1.5 / PERIOD / (2 * np.pi),
@@ -90,7 +90,7 @@ def stale_weight(scenario: Scenario, direction):
 def exact_two_port(scenario: Scenario, omega):
     """Return H of one axis with ideal sensor, delayed weight and a tool that a force rotates.
 
-    The slave's motion is that of the command plus that of the push; the sensor feels the tool's
+    The slave's motion is that of command and push; the sensor measures the tool's
     mass times the acceleration of its centre, 125 us before the end of each period.
     """
     task = task_direction(scenario, UP)
@@ -99,7 +99,7 @@ def exact_two_port(scenario: Scenario, omega):
     mass = axis.device_mass + axis.hand_mass
     decay = np.exp(-axis.device_damping * T / mass)
     glide = mass / axis.device_damping * (1 - decay)
-    # x_m, v_m; x, v of So and of the tool's centre, by the command, and by the push; felt force |
+    # x_m, v_m; x, v of So and of the tool's centre, by the command, and by the push; sensor force |
     # hand's force, push. The servo pulls back each in its own direction.
     A = np.zeros((11, 13))
     A[0, :2], A[1, 1] = (1, glide), decay
