@@ -431,7 +431,7 @@ def test_a_block_works_beside_a_plant(name, time_step):
     elif name == "WrenchScaling":
         np.testing.assert_allclose(found["contact_wrench_S"], 0.0, atol=1e-9)
     elif name == "LoadEstimator":
-        assert np.abs(found["load_estimate"]).max() > 0.1  # it has learnt
+        assert np.abs(found["load_estimate"]).max() > 0.1  # load after these samples
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
