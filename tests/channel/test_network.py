@@ -1,4 +1,4 @@
-"""Network: the newest packet, the packet that is read, and their statistics."""
+"""Newest packet, received packet, and their statistics."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _exchange(p, state, packets, received, newest, fresh):
 
 
 def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):
-    """The step form over all packets: what is received, the newest step, whether it is new."""
+    """Return received packets, newest steps and whether they are new, from the step form."""
     p = network_parameters(config, seed, FORWARD, PERIOD)
     neutral = np.zeros(packets.shape[1]) if neutral is None else neutral
     received, newest = np.empty_like(packets), np.empty(len(packets), int)
@@ -97,20 +97,20 @@ def random_packets(steps: int = STEPS, seed: int = 0) -> np.ndarray:
     return packets
 
 
-def oracle(config: NetworkConfig, seed: int) -> np.ndarray:
-    """The newest packet from the definition: of all that have arrived, the one sent last."""
+def newest_by_definition(config: NetworkConfig, seed: int) -> np.ndarray:
+    """Return the newest packet by its definition: of all that have arrived, the one sent last."""
     playout = round(config.playout / PERIOD)
     arrivals = []
     for sent, copies in enumerate(packet_delays(config, seed, FORWARD, STEPS, PERIOD).tolist()):
         least = 0 if config.redundant else playout
         arrivals += [(sent + max(travel, least), sent) for travel in copies if travel >= 0]
     newest = [max((j for at, j in arrivals if at <= k), default=-1) for k in range(STEPS)]
-    if config.redundant:  # every sample up to the newest is there, and played at its time
+    if config.redundant:  # every sample up to the newest has arrived and is played at its time
         newest = [min(j, max(k - playout, -1)) for k, j in enumerate(newest)]
     return np.array(newest)
 
 
-# Which packet is the newest.
+# Newest packet
 
 
 @pytest.mark.slow
@@ -123,11 +123,11 @@ def test_step_form_equals_the_vectorised_form(config, seed):
     packets = random_packets()
     received, newest, fresh = exchange(config, packets, seed)
     np.testing.assert_array_equal(newest, newest_packets(config, seed, FORWARD, STEPS, PERIOD))
-    # What is read is the packet itself, whatever was lost, late or doubled.
+    # The received packet is the newest one, for any loss, delay or duplication.
     some = newest >= 0
     np.testing.assert_array_equal(received[some], packets[newest[some]])
     assert not received[~some].any()
-    # It never goes back, never comes from the future, and is new just when it changes.
+    # The index never decreases, is never in the future, and is new only when it changes.
     assert (np.diff(newest, prepend=-1) >= 0).all()
     assert (newest <= np.arange(STEPS)).all()
     np.testing.assert_array_equal(fresh, np.diff(newest, prepend=-1) > 0)
@@ -139,9 +139,9 @@ def test_step_form_equals_the_vectorised_form(config, seed):
 @example(replace(ROUGH, playout=0.05), 1)
 @example(replace(ROUGH, playout=0.05, redundant=True, rate_hz=300.0), 2)
 @example(replace(ROUGH, delay=0.1, playout=0.05, redundant=True), 3)
-def test_the_newest_is_the_last_sent_of_those_that_arrived(config, seed):
+def test_newest_packet_is_the_last_sent_of_all_arrivals(config, seed):
     np.testing.assert_array_equal(
-        newest_packets(config, seed, FORWARD, STEPS, PERIOD), oracle(config, seed)
+        newest_packets(config, seed, FORWARD, STEPS, PERIOD), newest_by_definition(config, seed)
     )
 
 
@@ -198,16 +198,16 @@ def test_a_playout_buffer_above_the_greatest_age_is_a_constant_delay(config, see
     oldest = int(age.max())
     packets = random_packets()
 
-    def over(config: NetworkConfig) -> bytes:
+    def received_bytes(config: NetworkConfig) -> bytes:
         return exchange(config, packets, seed)[0].tobytes()
 
     buffered = replace(config, playout=oldest * PERIOD, redundant=True)
-    assert over(buffered) == over(NetworkConfig(delay=oldest * PERIOD))
-    # One step less, and some sample comes too late: the bound is sharp.
+    assert received_bytes(buffered) == received_bytes(NetworkConfig(delay=oldest * PERIOD))
+    # With one step less, some sample arrives too late: the bound is sharp.
     if oldest > 0:
         sooner = (oldest - 1) * PERIOD
         late = replace(config, playout=sooner, redundant=True)
-        assert over(late) != over(NetworkConfig(delay=sooner))
+        assert received_bytes(late) != received_bytes(NetworkConfig(delay=sooner))
 
 
 @given(networks(), seeds)
@@ -219,7 +219,7 @@ def test_without_loss_the_playout_buffer_needs_no_redundancy(config, seed):
     np.testing.assert_array_equal(newest, constant)
 
 
-def test_the_seed_and_the_direction_decide():
+def test_packets_depend_on_seed_and_direction():
     first = newest_packets(ROUGH, 7, FORWARD, STEPS, PERIOD)
     np.testing.assert_array_equal(first, newest_packets(ROUGH, 7, FORWARD, STEPS, PERIOD))
     assert (first != newest_packets(ROUGH, 8, FORWARD, STEPS, PERIOD)).mean() > 0.5
@@ -233,15 +233,14 @@ def test_a_longer_run_begins_as_a_shorter_one():
     )
 
 
-def test_if_all_is_lost_nothing_is_received():
+def test_no_packet_is_received_if_all_are_lost():
     packets, neutral = random_packets(), np.arange(float(PACKET_SIZE))
     received, newest, fresh = exchange(NetworkConfig(loss=1.0, burst=0.1), packets, 0, neutral)
     assert (newest == -1).all() and not fresh.any()
     np.testing.assert_array_equal(received, np.tile(neutral, (STEPS, 1)))
 
 
-# Statistics. Tolerances are five standard deviations of the estimate, which the seed, fixed, passes
-# or fails for ever.
+# Statistics. Tolerances are five standard deviations of the estimate; the seed is fixed.
 
 MANY = 200_000
 
@@ -284,7 +283,7 @@ def test_delays_are_independent_of_each_other():
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
 def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
-    """A packet has sixteen numbers, each for one purpose."""
+    """Each of the sixteen numbers of a packet has one purpose."""
     config = NetworkConfig(
         delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
     )
@@ -292,7 +291,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
 
     def uniform(p, k, draw):
         taken.append((k, draw))
-        return 0.6  # nothing is lost, all comes twice
+        return 0.6  # no packet is lost, and each is duplicated
 
     monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
@@ -301,12 +300,12 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]
-    # The chain's, the duplicate's, and both delays'.
+    # Those of the chain, of the duplicate, and of both delays.
     assert len(taken) == len(set(taken)) == 20 * (2 + 2 * each)
 
 
 def runs_of(lost: np.ndarray) -> np.ndarray:
-    """The lengths of the runs of losses that begin and end inside."""
+    """Return the lengths of the runs of losses that begin and end inside."""
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     return np.diff(edges)[int(lost[0]) :: 2] if edges.size else edges
 
@@ -323,7 +322,7 @@ def test_loss_and_mean_length_of_its_bursts(loss, burst):
     runs, leave = runs_of(lost), (1 - loss) * (1 - memory)
     std = math.sqrt(1 - leave) / leave / math.sqrt(len(runs))
     assert runs.mean() == pytest.approx(1 / leave, abs=5 * std)
-    if burst == 0.02 and loss < 0.5:  # twenty packets: the sampling no longer matters
+    if burst == 0.02 and loss < 0.5:  # twenty packets: the effect of sampling is negligible
         assert 1 / leave == pytest.approx(burst / PERIOD, rel=0.04)
 
 
@@ -347,7 +346,7 @@ def test_bad_states_lose_their_share_and_good_ones_nothing():
     config = NetworkConfig(loss=0.19, burst=0.5, burst_loss=0.95)
     lost = packet_delays(config, 6, FORWARD, 10 * MANY, PERIOD)[:, 0] < 0
     share = np.convolve(lost, np.ones(20), "valid") / 20
-    # Windows of 20 ms inside a state: none is lost, or about 95 %; few lie in between.
+    # Within a state, windows of 20 ms lose no packet or about 95 %; few are in between.
     bad = share > 0.5
     assert bad.mean() == pytest.approx(0.2, abs=0.02)
     assert share[bad].mean() == pytest.approx(0.95, abs=0.02)
@@ -399,15 +398,15 @@ def test_presets_have_their_round_trip_time(name, round_trip):
     assert sum(means) * period == pytest.approx(round_trip, rel=0.01)
 
 
-def test_every_preset_is_named_here():
+def test_list_of_presets_is_complete():
     assert list(PRESETS) == ["ideal", "lan", "wan", "internet", "geostationary", "lunar"]
 
 
-# What the receiver reads while nothing comes.
+# Received packet without arrivals
 
 
-def lonely(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
-    """A packet that moves and turns, and what is read so many steps after it, the last one."""
+def receive_after_silence(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a packet with motion, and the packet received `silent` steps after it."""
     p = network_parameters(NetworkConfig(silence=silence, rate_hz=1.0), 0, FORWARD, PERIOD)
     packet = random_packets(1)[0]
     packet[POSE][:4] /= np.linalg.norm(packet[POSE][:4])
@@ -421,8 +420,8 @@ def lonely(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])
 @pytest.mark.parametrize("silent", [0, 1, 50, 300])
-def test_silence(silence, silent):
-    packet, received = lonely(silence, silent)
+def test_packet_is_held_zero_or_extrapolated_during_silence(silence, silent):
+    packet, received = receive_after_silence(silence, silent)
     expected = packet.copy()
     if silent and silence == "zero":
         expected[VELOCITY] = expected[WRENCH] = expected[PACKET_LOAD_WRENCH] = 0.0
@@ -436,7 +435,7 @@ def test_silence(silence, silent):
         if silent * PERIOD > MAX_POSE_EXTRAPOLATION_S:
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
-    # Whatever the policy, counters and integrals stand still: silence brings no energy.
+    # Counters and integrals are constant for any policy: silence adds no energy.
     for part in (INTEGRAL, slice(CUMULATIVE_ENERGY.start, PACKET_LOAD_WRENCH.start)):
         np.testing.assert_array_equal(received[part], packet[part])
 
@@ -462,7 +461,7 @@ def test_before_the_first_packet_there_are_zeros(silence):
     assert (newest[:50] == -1).all() and not received[:50].any()
 
 
-# Recorded delays.
+# Recorded delays
 
 
 def write_trace(path, text: str) -> NetworkConfig:
@@ -520,7 +519,7 @@ def test_missing_trace_file_is_named():
         network_parameters(NetworkConfig(trace="nowhere.csv"), 0, FORWARD, PERIOD)
 
 
-# The configuration.
+# Configuration
 
 
 @pytest.mark.parametrize(
@@ -557,7 +556,7 @@ def test_it_loads_from_yaml():
         (NetworkConfig(delay=0.02), network.FORWARD, 1e-3),
         (NetworkConfig(delay=0.3, rate_hz=50.0), network.BACKWARD, 0.02),
         (NetworkConfig(loss=1.0), network.FORWARD, math.inf),
-        # The longest of the bad states of a minute, some n = 60 (0.3 / 0.08): 0.08 ln(n) and more.
+        # Longest bad state of a minute with n = 60 (0.3 / 0.08): at least 0.08 ln(n).
         (NetworkConfig(delay=0.05, jitter=0.5, loss=0.3, burst=0.08), network.BACKWARD, 0.49),
     ],
 )
