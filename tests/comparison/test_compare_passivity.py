@@ -113,7 +113,7 @@ def test_unknown_names_raise(tmp_path, arguments, message):
 
 
 def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
-    """It keeps tool and grip, and gets the study's rates and leaves."""
+    """The comparison keeps tool and grip, and uses the rates and leaves of the study."""
     mine = tmp_path / "mine.yaml"
     mine.write_text(
         "{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {},"
