@@ -30,7 +30,7 @@ EXPERIMENT = Experiment(
 
 
 class Person:
-    """Participant with a clock, who presses in each interval."""
+    """Participant with a clock who presses in each interval."""
 
     def __init__(self, folder) -> None:
         scenario = LoadScenario("contact_transition")
@@ -87,7 +87,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person.wait("interval")
     person.send(set={"z": -2500})
     person.wait("answer")
-    person.send(client=2, answer=1)  # a spectator
+    person.send(client=2, answer=1)  # spectator
     assert person.procedure.phase == "answer"
     person.send(answer=2)
     (row,) = person.store.read_rows(1)
@@ -112,7 +112,7 @@ def test_trial_restarts_after_the_page_is_closed(tmp_path):
     person.wait("gap")
     person.guided.leave(1, person.now)
     assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
-    person.send(client=2, go=True)  # has left
+    person.send(client=2, go=True)  # participant has disconnected
     person.guided.join(3, person.now)
     person.send(client=3, go=True)
     assert person.procedure.phase == "interval" and person.store.participant_numbers() == []
