@@ -185,7 +185,7 @@ def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("size_bytes", [60_000, 400_000])
 def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):
-    """For the inputs and the log."""
+    """The error is in writing the inputs or the log."""
     with small_disk(tmp_path, size_bytes):
         live = make(scenario, load, clock, tmp_path / "drive")
         live.join(1, clock())
