@@ -93,7 +93,7 @@ def test_correct_is_the_inverse_of_apply(gain):
 
 
 def test_calm_half_is_the_narrowest_half_of_each_channel():
-    """Of 8 numbers 5 are within 2 half widths: the half has 4 intervals."""
+    """Five of 8 numbers are within 2 half widths: the half has 4 intervals."""
     x = np.array([5.0, 5.25, 5.5, 5.75, 6.0, 9.0, -20.0, 40.0])
     spread, centres = spread_and_centre_of_calm_half(
         np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3)

@@ -128,7 +128,7 @@ def test_resampling_to_a_slower_clock_does_not_alias(ratio):
     np.testing.assert_allclose(seen[:, 1], np.sin(2 * np.pi * 3.0 * t)[50:-50], atol=0.01)
 
 
-def test_white_noise_is_seen_under_a_smooth_motion() -> None:
+def test_white_noise_is_estimated_beside_a_smooth_motion() -> None:
     rng, sigma = np.random.default_rng(4), np.array([0.02, 0.3, 1.5])
     t = np.arange(0, 20, 1e-3)[:, None]
     motion = 20 * np.sin(2 * np.pi * np.array([0.5, 1.0, 2.0]) * t)
