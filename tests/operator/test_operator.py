@@ -151,7 +151,7 @@ def test_hand_force_and_torque_are_limited():
 
 @pytest.mark.parametrize("grip", list(GRIP_IMPEDANCES))
 def test_hand_yields_to_the_displayed_force(grip):
-    """At rest the hand deflects by F / K."""
+    """The hand at rest deflects by F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
     viscous = JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
     config = OperatorConfig(grip=grip)

@@ -28,7 +28,7 @@ def record(mass: float, steady: float, push: float, amplitude: float = 0.0):
     velocity, force = np.zeros((len(T), 3)), np.zeros((len(T), 3))
     velocity[:, 2] = amplitude * omega * np.sin(omega * T)
     acceleration = amplitude * omega**2 * np.cos(omega * T)
-    # Of the hand on the stylus: it carries, accelerates, and answers the push downwards.
+    # Forces of the hand on the stylus: it carries, accelerates, and resists the push downwards.
     force[:, 2] = steady + mass * acceleration - push * (T >= PUSH)
     return force, velocity
 
