@@ -1,4 +1,4 @@
-"""Passive set-position modulation: its ledger is the energy of the true port, to rounding."""
+"""Passive set-position modulation: its ledger equals the energy of the actual port."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def groups(values):
 def test_stored_energy_is_what_was_put_in(end):
     """E + spring = E_0 + received - sent - lost - work of the held wrench, at every step.
 
-    Wrench and spring are found from what the end puts out, not from its memory.
+    Wrench and spring are computed from the outputs, not from the memory.
     """
     rng = np.random.default_rng(4)
     config = PassivityConfig(
         method="pspm",
         servo_stiffness=[300.0, 5.0],
         servo_damping=[2.0, 0.02],
-        retreat=[1e3, 1e3],  # else the wrench does not tell the spring
+        retreat=[1e3, 1e3],  # otherwise the wrench does not determine the spring
     )
     p, m = method_parameters(config), step_addresses("pspm")
     memory = initial_method_memory("pspm", p, START)

@@ -26,11 +26,11 @@ T, STEPS = 1e-3, 1200
 
 
 def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
-    """Wrench at the hand and motion of the slave's command (x alone), both (N,).
+    """Return the wrench at the hand and the motion of the slave's command (x alone), both (N,).
 
     `contact(u, x)` is the force of the slave's end [N], for the wave u that arrives there and the
-    command x of the last step; packets travel for `forward` and `backward` steps. At the steps
-    `missing` none comes to the hand; for the first `fills` the slave's command stays.
+    command x of the last step; packets travel for `forward` and `backward` steps. No packet arrives
+    at the hand at steps `missing`; the slave's command is constant for the first `fills` steps.
     """
     p = method_parameters(
         PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config)
@@ -110,8 +110,8 @@ def test_a_line_that_filled_in_contact_holds_it(delay):
 
 @pytest.mark.parametrize("delay", [1, 40, 300])
 def test_line_that_filled_in_contact_releases_only_its_energy(delay):
-    """f^2 (T + filter) / 2 b for a round trip of 2 T: to a wall that is matched, and a hand that
-    gives way as fast as takes the most from it."""
+    """The energy is f^2 (T + filter) / 2 b for a round trip of 2 T, a matched wall and a hand
+    whose speed extracts the most."""
     config, force, begin, steps = WaveConfig(), 5.0, 2 * delay + 100, 3 * delay + 300
     b = config.impedance[0]
     given = []
