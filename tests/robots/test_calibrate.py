@@ -1,4 +1,4 @@
-"""Calibration from a stream: parameters are known when they are, and not before."""
+"""Calibration from a stream: parameters are reported only when they are determined."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
             calibrate(Live(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(Live(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # nothing came
+        calibrate(Live(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # no data
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
@@ -191,7 +191,7 @@ def test_command_reports_the_time_of_a_tare(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_advice_is_the_missing_motion(axis: int) -> None:
-    """At rest the advice is a rotation about a horizontal axis."""
+    """The advice at rest is a rotation about a horizontal axis."""
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
     errors = derivatives_over_tolerances(parse_tolerance("inertia 1 %"), PHI)
@@ -256,7 +256,7 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
         recorder.add((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
         recorder.add((Part(POSE, k, 1e4 + DT * k, pose), DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
-    for k in range(100):  # both were set
+    for k in range(100):  # both clocks were set
         recorder.add((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
         recorder.add((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1

@@ -84,7 +84,7 @@ def compensated(
     sought = ChangeMonitor(DT, live=live, report=messages.append) if looked_for else None
     sink = ListSink()
     compensator = Compensator(LOAD, DT, watch=ContactAndLoadMonitor(LOAD, DT, 30.0))
-    # As fast as it comes: the clock of the loop is that of the readings.
+    # As fast as possible: the clock of the loop is that of the readings.
     compensate_stream(Readings(values, live=False), compensator, sink, changes=sought)
     if sought is not None:
         sought.close()

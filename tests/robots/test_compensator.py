@@ -72,7 +72,7 @@ class ListSink:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """2 s with a push, noise, a late motion, and a gap."""
+    """Return 2 s with a push, noise, a late motion, and a gap."""
     t = DT * np.arange(1000)
     rng = np.random.default_rng(3)
     wrench = non_contact_wrench(*moving(t), PHI) + OFFSETS + 0.1 * rng.normal(size=(1000, 6))

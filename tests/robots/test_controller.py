@@ -37,7 +37,7 @@ def status(arguments: list[str]) -> int:
 
 @pytest.fixture
 def exported(tmp_path, monkeypatch) -> Path:
-    """The folder that the command of docs/controller.md writes."""
+    """Return the folder that the command of docs/controller.md writes."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out" / "load").mkdir(parents=True)
     kernel.LOAD.save(tmp_path / "out" / "load" / "identification.json")

@@ -62,7 +62,7 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
             process.kill()
 
 
-class Seen(list[CompensatedWrench]):
+class LoopOutputs(list[CompensatedWrench]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(
@@ -102,7 +102,7 @@ class Seen(list[CompensatedWrench]):
         return out
 
     def check(self, flags: ReadingFlag) -> None:
-        """The story of the peer: named, zero, and good again by itself."""
+        """Check that faults are flagged with zero output, and that good outputs follow."""
         assert np.isfinite([[*row.contact, *row.scaled, row.t] for row in self]).all()
         assert not any(row.contact.any() or row.scaled.any() for row in self if row.flags)
         named = ReadingFlag(0)
@@ -128,9 +128,9 @@ def free_port() -> str:
 
 def test_udp() -> None:
     source = UdpSource("udp://:0", 0.002)
-    Compensator(load(), source.dt)  # loads what is compiled: the sender waits for nobody
+    Compensator(load(), source.dt)  # loads compiled functions: the sender does not wait
     with peer("udp", str(source.port)):
-        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
+        seen = LoopOutputs(source, 510, ReadingFlag.CLOCK_JUMP)
     source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -141,13 +141,13 @@ def test_udp() -> None:
     )
     seen.check(flags | ReadingFlag.RESTART | ReadingFlag.CLOCK_JUMP)
     numbers = [row.number for row in seen]
-    assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
+    assert numbers[numbers.index(12) - 1] == 8  # and no data instead of the lost packets
 
 
 def test_netft() -> None:
     with peer("netft") as (port, _):
         source = NetFtSource(f"netft://127.0.0.1:{port}?counts=1000,1000&sign=1", 0.002)
-        seen = Seen(source, 10)
+        seen = LoopOutputs(source, 10)
         source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -158,7 +158,7 @@ def test_netft() -> None:
     )
     seen.check(flags)
     numbers = [row.number for row in seen]
-    assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
+    assert numbers[numbers.index(12) - 1] == 8  # and no data instead of the lost packets
 
 
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
@@ -166,7 +166,7 @@ def test_rtde() -> None:
     sockets.on_purpose.add(30004)  # of this machine, but not 127.0.0.1
     with peer("rtde", ADDRESS) as (host, _):
         source = RtdeSource(f"rtde://{host}?sign=1")
-        seen = Seen(source, 510)
+        seen = LoopOutputs(source, 510)
         source.close()
     assert source.dt == 0.002
     seen.check(
@@ -185,7 +185,7 @@ def test_rtde() -> None:
 def test_ros_2() -> None:
     with peer("ros", free_port()) as (port, _):
         source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
-        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
+        seen = LoopOutputs(source, 510, ReadingFlag.CLOCK_JUMP)
         source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -232,7 +232,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
         page.send(json.dumps(asked))
         for row in rows:
             file.write(row)
-        while True:  # the subscription is answered by nothing
+        while True:  # no node answers the subscription
             live.write(rows[2])
             with contextlib.suppress(TimeoutError):
                 shown = page.recv(timeout=0.01)

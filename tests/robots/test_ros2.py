@@ -46,7 +46,7 @@ def process(*words: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
 
 
 class Echo(list[dict[str, Any]]):
-    """Lines of a peer's node, as they arrive."""
+    """Lines of a peer's node in the order of arrival."""
 
     def __init__(self, started: subprocess.Popen[str]) -> None:
         self._thread = threading.Thread(target=self._read, args=(started,), daemon=True)

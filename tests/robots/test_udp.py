@@ -231,7 +231,7 @@ def test_table_contains_the_rows_before_a_kill(tmp_path: Path, name: str, after:
     assert len(rows) >= last - 60  # of which 1000 come in a second
 
 
-class Failing:
+class FailingSink:
     """Sink that is used until the disk is full, or until an error or Ctrl-C."""
 
     def __init__(self, sink: lines.TableSink) -> None:
@@ -249,7 +249,7 @@ class Failing:
 def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
     monkeypatch.setattr(lines, "TABLE_WRITE_PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
-        failing = Failing(lines.TableSink(tmp_path / name))
+        failing = FailingSink(lines.TableSink(tmp_path / name))
         failing.write_until(CannotWrite)
         with pytest.raises(CannotWrite):
             failing.sink.close()
@@ -262,7 +262,7 @@ def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
 def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error) -> None:
     """This includes an interrupt while rows are written."""
-    failing, path = Failing(lines.TableSink(tmp_path / name)), tmp_path / name
+    failing, path = FailingSink(lines.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lines.time, "monotonic", lambda: (_ for _ in ()).throw(error))
@@ -370,7 +370,7 @@ def test_delayed_signals_are_handled_at_the_end(number: signal.Signals) -> None:
 
 def test_control_port_answers_tare_requests() -> None:
     control = TareRequestPort(0)
-    control.answer_request(lambda: "")  # nothing was asked
+    control.answer_request(lambda: "")  # no request
     with udp.open_udp_receiver(udp.LOCALHOST, 0) as asker:
         asker.settimeout(5.0)
         for word in (b"tare\n", b"tear"):
