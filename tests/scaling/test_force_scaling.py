@@ -24,9 +24,9 @@ def arm():
 def outputs(
     config: ForceScalingConfig, arm, contact=(0.0,) * 6, scales: dict[str, float] | None = None
 ) -> dict[str, np.ndarray]:
-    """The block's outputs for one sample of a load that moves and touches something.
+    """Return the block's outputs for one sample of a load that moves in contact.
 
-    With `scales`, after these were set while it runs.
+    Given `scales` are set while it runs.
     """
     rng = np.random.default_rng(3)
     motion, offsets = rng.normal(size=(3, 3)) * 5, rng.normal(size=6)
@@ -92,7 +92,7 @@ Q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 
 
 def weight_wrench(arm, phi) -> np.ndarray:
-    """The wrench V(-g) phi in the pose of `outputs`."""
+    """Return the wrench V(-g) phi in the pose of `outputs`."""
     gravity = np.empty(3)
     sensor_acceleration_into(arm.table, Q, np.zeros(3), gravity)
     assert np.linalg.norm(gravity) == pytest.approx(9.81, rel=1e-3)

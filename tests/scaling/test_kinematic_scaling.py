@@ -109,7 +109,7 @@ def test_commanded_quaternion_has_norm_one(pose, master, command):
 
 
 class HandAndClutch(LeafSystem):
-    """A moving master and a clutch that opens and closes."""
+    """Moving master, and a clutch that opens and closes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class HandAndClutch(LeafSystem):
 
 
 def commands(config, start, times) -> np.ndarray:
-    """The commanded poses at `times`, sampled at 1 kHz."""
+    """Return the commanded poses at `times`, sampled at 1 kHz."""
     builder = DiagramBuilder()
     source = builder.AddSystem(HandAndClutch())
     scaling = builder.AddSystem(KinematicScaling(config, 1e-3, start))
