@@ -49,7 +49,7 @@ T = 1 / 8000
 SOURCES = ("encoders", "accelerometer", "fused")
 ARM = AddSlavePlant(DiagramBuilder(), Slave(), None, np.zeros(6)).arm
 JR3 = PRESETS["jr3_85m35a3"]
-#: Nothing but its low-pass, and an accelerometer that is somewhere and looks somewhere else.
+#: Sensor with low-pass only, and an accelerometer at a wrong place and orientation.
 QUIET = dataclasses.replace(
     without_parts(JR3, "noise", "random_walk", "offset", "drift", "quantisation"),
     p_SoAo_S=[0.02, -0.03, 0.05],
@@ -57,7 +57,7 @@ QUIET = dataclasses.replace(
 )
 
 
-@functools.cache  # what it compiles is not for each worker to compile while it collects
+@functools.cache  # compilation in each worker during collection is avoided
 def home() -> Array:
     return home_posture(ARM, [0.55, 0.0, 0.45])
 
@@ -77,18 +77,18 @@ def sampled(
     truth: Array,
     sensor: WristSensorConfig,
     config: MotionEstimationConfig,
-    believed: WristSensorConfig | None = None,
+    nominal: WristSensorConfig | None = None,
     table: Array = ARM.table,
     seed: int = 0,
 ) -> Array:
-    """Return samples of sensor and estimation; `believed` is the nominal sensor."""
+    """Return samples of sensor and estimation; `nominal` is the nominal sensor."""
     n = truth.shape[1] - 15
     noise = np.random.default_rng(seed).standard_normal(
         (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE)
     )
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
     chain, chain_memory = initialize_sensor_chain(sensor, n, T)
-    constants, memory = initialize_motion_estimator(config, believed or sensor, n, T)
+    constants, memory = initialize_motion_estimator(config, nominal or sensor, n, T)
     for k in range(len(truth)):
         read_sensor_into(
             chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
@@ -141,7 +141,7 @@ def fast() -> Array:
 SETTLED = 8000
 
 
-# What comes out without errors of the sensor
+# Outputs without errors of the sensor
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_noiseless_sensor_gives_truth_of_one_earlier_instant(source, tolerance, 
 
 
 def test_noiseless_accelerometer_sample_is_moved_and_filtered(fast):
-    """At So, with the wrench's low-pass; omega is the slope of the filtered angles."""
+    """The sample is at So with the wrench's low-pass; omega is the slope of filtered angles."""
     sensor = dataclasses.replace(QUIET, p_SoAo_S=[0.0] * 3, R_SA=list(np.eye(3).ravel()))
     config = MotionEstimationConfig(source="accelerometer")
     samples = sampled(fast, sensor, config)
@@ -264,8 +264,8 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
     config = MotionEstimationConfig("accelerometer")
     t = np.arange(12000) * T
 
-    def left(truth: Array, believed: WristSensorConfig) -> float:
-        return rms(eliminated(sampled(truth, late, config, believed)[SETTLED:])[:, :3])
+    def left(truth: Array, nominal: WristSensorConfig) -> float:
+        return rms(eliminated(sampled(truth, late, config, nominal)[SETTLED:])[:, :3])
 
     def inertial(truth: Array) -> float:
         """Return the residual after elimination of the weight only."""
@@ -348,7 +348,7 @@ def test_gains_of_the_jr3_equal_the_docs():
     assert np.cbrt(linear[2] / T) / (2 * np.pi) == pytest.approx(18.4, abs=0.1)
 
 
-# What the elimination leaves of the paper's 100 N
+# Residual of the elimination for the paper's 100 N
 
 
 def left(fast: Array, sensor: WristSensorConfig, source: str) -> tuple[float, float]:
@@ -377,7 +377,7 @@ def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("source", ["encoders", "accelerometer"])
 def test_motion_noise_equals_the_prediction(source, preset):
-    """For encoders on average over the axes."""
+    """Encoders agree on average over the axes."""
     real = without_parts(PRESETS[preset], "random_walk", "offset", "drift", "saturation")
     config = MotionEstimationConfig(source)
     truth = truth_of(swinging(np.arange(16000) * T))

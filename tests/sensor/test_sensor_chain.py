@@ -296,7 +296,7 @@ def test_overload_including_offset_is_not_plausible():
     assert are_values_plausible(constants, truth)
     truth[0] = 0.99 * largest
     assert are_values_plausible(constants, truth)
-    constants[0] = 0.02 * largest  # of the offset
+    constants[0] = 0.02 * largest  # as with the offset
     assert not are_values_plausible(constants, truth)
     truth[0] = 0.0
     assert are_values_plausible(constants, truth)
@@ -327,7 +327,7 @@ def test_each_path_is_late_by_its_whole_samples(late, joints):
     found, expected = readings(config, truths), as_read(truths)
     columns = np.repeat(late[:2], 6).tolist() + [0] + [encoders] * joints
     before = np.arange(100)[:, None] - np.array(columns)
-    rows = np.maximum(before, 0)  # before the first sample it rested there
+    rows = np.maximum(before, 0)  # the output is constant before the first sample
     np.testing.assert_array_equal(found, np.take_along_axis(expected, rows, axis=0))
 
 
@@ -341,7 +341,7 @@ def test_the_ideal_sensor_is_never_late():
 # Spectrum and Allan deviation
 
 LONG = 2**18
-#: What stands alone, and the two sensors with all of it.
+#: Each effect separately, and the two sensors with all of them.
 AT_REST = {
     "white": part(force_noise=0.25, torque_noise=0.01),
     "white and quantum": part(  # noise of 0.8 quanta: rounding adds 13 % to the power

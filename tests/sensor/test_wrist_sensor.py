@@ -189,7 +189,7 @@ def test_sample_time_is_the_instant_of_the_sample():
 
 
 def test_one_sample_for_equal_instants_with_rounding():
-    """At 7 kHz rounding makes a row's time later than the same instant of the 2 kHz events."""
+    """Rounding at 7 kHz makes a row's time later than the same instant of the 2 kHz events."""
     result = swinging(7000.0)
     np.testing.assert_allclose(result["sample_time"][1:, 0], result.t[:-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(
