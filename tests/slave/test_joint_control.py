@@ -51,7 +51,7 @@ def test_torque_with_invalid_encoders_or_command(arm, bad):
     gravity = torque(arm, q, q, np.zeros(6))
     np.testing.assert_array_equal(torque(arm, q, q + one, np.ones(6)), gravity)
     np.testing.assert_array_equal(torque(arm, q, q + 0.1, one), gravity)
-    np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # what stood there
+    np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # previous content
 
 
 def test_joints_are_decoupled(arm):

@@ -17,7 +17,7 @@ FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
 
 
 class Arm:
-    """The plant alone, with constant motor torques."""
+    """Plant alone, with constant motor torques."""
 
     def __init__(self, friction):
         builder = DiagramBuilder()

@@ -32,11 +32,11 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
 )
 from drake_teleop.station.station import MakeTeleopStation
 
-# What compiles takes three seconds, once.
+# Functions are compiled once, within three seconds.
 pytestmark = pytest.mark.slow
 
 PERIOD = 5e-4
-#: The RX90 with its elbow well bent and its wrist stretched.
+#: RX90 with its elbow bent and its wrist stretched.
 STRETCHED = np.array([0.2, -0.5, -1.6, 0.7, 0.0, 0.4])
 BENT = np.array([0.2, -0.5, -1.6, 0.7, 0.8, 0.4])
 
@@ -184,7 +184,7 @@ def test_joint_speed_stays_within_limits_at_singular_wrist(rx90, aside):
     assert sweep(rx90, start, closed)[0] > 20  # it is a singularity that is crossed
     largest, errors, statuses = sweep(rx90, start, numeric)
     assert largest < 1 + 1e-9
-    assert max(errors) < 1e-5  # the rest of it goes slowly
+    assert max(errors) < 1e-5  # the rest is slow
     assert {IkStatus.OK, IkStatus.WRIST_SINGULAR, IkStatus.SPEED_LIMIT} <= statuses
     assert IkStatus.JOINT_LIMIT not in statuses
 
