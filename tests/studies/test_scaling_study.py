@@ -121,7 +121,7 @@ def test_shipped_studies_share_their_scales():
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_scaling_study_command_writes_its_answer(tmp_path, monkeypatch):
-    """With synthetic rows instead of runs."""
+    """The rows are synthetic."""
 
     def made_up(name, out, *, repeats, **others):
         study = LoadStudy(name)

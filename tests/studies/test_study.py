@@ -143,7 +143,7 @@ def two_runs(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
-    """With two runs each."""
+    """Each study has two runs."""
     monkeypatch.chdir(tmp_path)
     docs = Path(__file__).parents[2] / "docs"
     page = (docs / "studies.md").read_text(encoding="utf-8")
