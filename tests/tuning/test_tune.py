@@ -87,7 +87,7 @@ def test_station_holds_only_if_it_rests_quietly_and_renders_the_force(change):
 
 
 class FakeStation:
-    """Answers of a station that is stable with `ledger` below a product of gamma and wall."""
+    """Station that is stable with `ledger` below a product of gamma and wall."""
 
     def __init__(self, limit: float, one_axis_limit: float) -> None:
         self.limit, self.one_axis_limit, self.names = limit, one_axis_limit, []
