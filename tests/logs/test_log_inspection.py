@@ -305,7 +305,7 @@ def test_unknown_unit_has_a_placeholder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "streams", "lacking"),
+    ("columns", "streams", "missing"),
     [
         (
             ["qw", "qx", "qy", "qz"],
