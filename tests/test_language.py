@@ -15,9 +15,9 @@ pytestmark = pytest.mark.checks
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_teleop"
-FOLDERS = ("tests", "benchmarks", "docs", "docs/_ext", "docs/gallery")
+FOLDERS = ("tests", "tests/*", "benchmarks", "docs", "docs/_ext", "docs/gallery")
 FILES = sorted(
-    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in (ROOT / each).glob("*.py"))]
+    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in ROOT.glob(f"{each}/*.py"))]
 )
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
