@@ -57,8 +57,8 @@ def test_llewellyn_agrees_with_search_over_lossless_loads():
     rng = np.random.default_rng(2)
     for h, is_stable in zip(H[:200], stable[:200], strict=True):
         z_e = 1j * np.tan(rng.uniform(-np.pi / 2, np.pi / 2, 20000)) * np.exp(rng.normal())
-        felt = tp.transmitted_impedance(h, z_e).real
-        assert not (is_stable and felt.min() < 0)
+        displayed = tp.transmitted_impedance(h, z_e).real
+        assert not (is_stable and displayed.min() < 0)
 
 
 def random_station(rng: np.random.Generator) -> OneAxis:
@@ -94,17 +94,17 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
         def environment(s, x=loads.environment_reactance, w=w):
             return s * x / w if x > 0 else -w * x / s
 
-        def felt(s, axis=axis, environment=environment):
+        def displayed(s, axis=axis, environment=environment):
             return tp.transmitted_impedance(tp.hybrid_matrix(axis, s), environment(s))
 
         # The hand's reactance is made of a spring and a mass that dominates the loop's.
-        slope = abs(felt(1j * w * 1.0001) - felt(1j * w)) / (1e-4 * w)
+        slope = abs(displayed(1j * w * 1.0001) - displayed(1j * w)) / (1e-4 * w)
         mass = max(100 * slope, 100 * abs(loads.loop_resistance) / w, abs(loads.hand_reactance) / w)
         spring = mass * w**2 - loads.hand_reactance * w
         assert spring >= 0
 
-        def around(s, mass=mass, spring=spring, felt=felt):
-            return mass * s + spring / s + felt(s)
+        def around(s, mass=mass, spring=spring, displayed=displayed):
+            return mass * s + spring / s + displayed(s)
 
         s = 1j * w - loads.loop_resistance / (2 * mass)
         for _ in range(20):
@@ -160,8 +160,8 @@ def test_position_force_is_not_absolutely_stable_even_without_delay():
     # 890 is the value at 10^4 rad/s; it grows without limit, k_f m_s w / 2.
     assert np.argmax(needed) == len(omega) - 1
     for w in (1e5, 1e6):
-        last = ab.required_damping(pd_station(np.array([w]), axis))[0]
-        assert last == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
+        largest_valid = ab.required_damping(pd_station(np.array([w]), axis))[0]
+        assert largest_valid == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
     # It is the damping at which no lossless load gives a negative resistance.
     some = slice(1000, None, 100)
     less = tp.absorb_impedances(H, hand=0.999 * needed)
@@ -314,7 +314,7 @@ def test_ranges_with_delay_agree_with_closed_form_of_their_members(hand):
     assert 2 * first == pytest.approx(0.0087, rel=0.02)  # Light grip against the leaf.
 
 
-def last(holds, high):
+def largest_valid(holds, high):
     """Return the limit up to which `holds`, by bisection from 0."""
     low = 0.0
     while high - low > 1e-3 * high:
@@ -345,7 +345,7 @@ def test_disc_criterion_is_conservative_by_the_known_factor():
         def small(stiffness, H=H):
             return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
 
-        largest, sufficient = last(quiet, 1e4), last(small, 1e4)
+        largest, sufficient = largest_valid(quiet, 1e4), largest_valid(small, 1e4)
         limit = np.min(ab.stiffness_limit(H, omega, hand))
         assert limit == pytest.approx(largest, rel=2e-3)
         assert largest == pytest.approx(exact, rel=0.02)

@@ -171,10 +171,9 @@ def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
-    """Half a period in the servo's loop; a period and the low-pass's delay on the force's way.
+    """The servo's loop has half a period more delay, the force a period and the low-pass's.
 
-    An input of the model that is held acts on the sensor 1.5 of its samples sooner than a smooth
-    one would.
+    A held input of the model acts on the sensor 1.5 samples earlier than a smooth one.
     """
     scenario = replace(LoadScenario("free_motion_force"), force_scaling__sigma=sigma)
     task = task_direction(scenario, UP)
@@ -217,7 +216,7 @@ def test_sideways_force_rotates_the_tool():
 @pytest.mark.long
 @pytest.mark.slow
 def test_sideways_tip_compliance_includes_the_hands_wrist():
-    """A force at the tip is a torque at the hand; the tool turns: 130 times softer."""
+    """A force at the tip is a torque at the hand, which rotates the tool: 130 times softer."""
     scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     system = wired(linearize(scenario, load_estimate=true_load(scenario)))

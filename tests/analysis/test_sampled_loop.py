@@ -220,7 +220,7 @@ def test_the_dominant_multiplier_is_the_largest_eigenvalue(
 
 
 def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
-    """Two seconds one way would be 8000 registers; the multiplier still closes the loop."""
+    """A delay of two seconds in one direction would be 8000 registers."""
     loop = cut_loop(replace(OneAxis(), sigma=np.array([0.0, 1.0])), STATION)
     delay = np.array([[0.02], [2.0]])
     found = dominant_multiplier(loop, delay)
