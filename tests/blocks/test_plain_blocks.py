@@ -278,7 +278,7 @@ def ports(block, kind) -> str:
     return ", ".join(f"`{get(k).get_name()}` {get(k).size()}" for k in range(count))
 
 
-def test_the_table_of_blocks_is_that_of_the_real_ports():
+def test_table_of_blocks_equals_the_actual_ports():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
     found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:6]] for row in rows}
     assert {*found} == {*EXAMPLES}
@@ -295,7 +295,7 @@ def test_the_table_of_blocks_is_that_of_the_real_ports():
 
 
 @pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in GENERIC])
-def test_a_conversion_that_is_impossible_is_one_line(name):
+def test_impossible_conversion_raises_one_line(name):
     block = EXAMPLES[name]()
     for convert in (block.ToAutoDiffXd, block.ToSymbolic):
         with pytest.raises(DrakeTeleopError, match=rf"^{name}: .* for double only; .*$"):
@@ -303,7 +303,7 @@ def test_a_conversion_that_is_impossible_is_one_line(name):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_two_ends_and_two_networks_equal_the_channel_of_the_station(method):
+def test_ends_and_networks_equal_the_channel_of_the_station(method):
     line = NetworkConfig(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1)
     passivity, scales = PassivityConfig(method=method), np.array([2.0, 1.0])
     if method == "ledger":
