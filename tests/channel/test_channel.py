@@ -86,7 +86,7 @@ def run(scenario: Scenario, load_estimate: np.ndarray):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 40])
-def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate):
+def test_channel_without_method_delays_both_directions(steps, load_estimate):
     """Outputs are delayed inputs up to rounding; samples and log are at 2 kHz."""
     result = run(moving(channel__delay=steps / 2000), load_estimate)
     np.testing.assert_allclose(
@@ -100,13 +100,13 @@ def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate)
 
 
 @pytest.mark.parametrize("channel", [Channel(), Channel(network="ideal")])
-def test_an_ideal_network_without_a_method_is_wires(channel):
+def test_ideal_network_without_method_changes_no_signal(channel):
     side = MakeChannel(moving(channel=channel))
     assert [type(block) for block in side.GetSystems()] == [PassThrough, PassThrough]
     assert not side.HasInputPort("hand_wrench_E") and not side.HasOutputPort("ports")
 
 
-def test_the_ports_count_the_work_of_the_hand(load_estimate):
+def test_ports_contain_the_work_of_the_hand(load_estimate):
     """Against the same sum over the logged force and motion of the stylus itself."""
     result = run(moving(channel__delay=0.01), load_estimate)
     force, twist = result["force_to_master"], result["pose_command"][:, 4:]
@@ -190,7 +190,7 @@ def test_invalid_channel_is_rejected(changes, message, load_estimate):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
+def test_temporary_failure_of_the_wrist_sensor_stops_the_station_smoothly(
     monkeypatch, load_estimate
 ):
     """The wrench is NaN from 0.2 to 0.4 s while the hand moves."""

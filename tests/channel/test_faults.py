@@ -95,7 +95,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
-def test_the_flag_of_contact_travels_with_the_packets(method):
+def test_packets_contain_the_contact_flag(method):
     found = run(method, None)
     touched, told = found.touched, found.felt[:, 6]
     late = round(DELAY / T)
@@ -107,7 +107,7 @@ def test_the_flag_of_contact_travels_with_the_packets(method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
+def test_signals_are_smooth_and_bounded_and_recover_after_a_fault(method, fault):
     sound, faulty = run(method, None), run(method, fault, bad=np.inf)
     t, x, f = faulty.t, faulty.command[:, 4], faulty.felt[:, 0]
     assert np.isfinite(faulty.command).all() and np.isfinite(faulty.felt).all()

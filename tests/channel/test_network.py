@@ -73,7 +73,7 @@ def networks(draw) -> NetworkConfig:
 seeds = st.integers(0, 2**63 - 1)
 
 
-# Not cached: numba would not see that the functions which it calls have changed.
+# Not cached: numba does not detect changes of called functions.
 @njit
 def _exchange(p, state, packets, received, newest, fresh):
     for k in range(len(packets)):
@@ -160,7 +160,7 @@ def test_a_constant_delay_is_a_shift(steps):
 
 
 @given(networks(), seeds)
-def test_duplicates_only_ever_bring_a_packet_sooner(config, seed):
+def test_duplicates_only_reduce_the_delay(config, seed):
     once = newest_packets(replace(config, duplicate=0.0), seed, FORWARD, STEPS, PERIOD)
     twice = newest_packets(replace(config, duplicate=1.0), seed, FORWARD, STEPS, PERIOD)
     assert (twice >= once).all()
@@ -226,7 +226,7 @@ def test_packets_depend_on_seed_and_direction():
     assert (first != newest_packets(ROUGH, 7, BACKWARD, STEPS, PERIOD)).mean() > 0.5
 
 
-def test_a_longer_run_begins_as_a_shorter_one():
+def test_longer_run_has_the_packets_of_a_shorter_one():
     np.testing.assert_array_equal(
         newest_packets(ROUGH, 3, FORWARD, 10 * STEPS, PERIOD)[:STEPS],
         newest_packets(ROUGH, 3, FORWARD, STEPS, PERIOD),
@@ -326,13 +326,13 @@ def test_loss_and_mean_length_of_its_bursts(loss, burst):
         assert 1 / leave == pytest.approx(burst / PERIOD, rel=0.04)
 
 
-def test_a_network_is_as_bad_at_its_first_step_as_later():
+def test_loss_is_equal_at_the_first_and_later_steps():
     config = NetworkConfig(loss=0.3, burst=10.0)
     lost = [packet_delays(config, seed, FORWARD, 1, PERIOD)[0, 0] < 0 for seed in range(2000)]
     assert np.mean(lost) == pytest.approx(0.3, abs=5 * math.sqrt(0.21 / 2000))
 
 
-def test_bursts_last_as_long_at_every_packet_rate():
+def test_burst_length_is_independent_of_the_packet_rate():
     config, lengths = NetworkConfig(loss=0.2, burst=0.05), []
     for period in (5e-4, 2e-3):
         lost = packet_delays(config, 5, FORWARD, MANY, period)[:, 0] < 0
@@ -342,7 +342,7 @@ def test_bursts_last_as_long_at_every_packet_rate():
     assert lengths[1] == pytest.approx(0.05, rel=0.1)
 
 
-def test_bad_states_lose_their_share_and_good_ones_nothing():
+def test_only_bad_states_lose_packets():
     config = NetworkConfig(loss=0.19, burst=0.5, burst_loss=0.95)
     lost = packet_delays(config, 6, FORWARD, 10 * MANY, PERIOD)[:, 0] < 0
     share = np.convolve(lost, np.ones(20), "valid") / 20
@@ -353,7 +353,7 @@ def test_bad_states_lose_their_share_and_good_ones_nothing():
     assert (share[~bad] == 0).mean() > 0.97
 
 
-def test_duplicates_are_a_share_of_what_arrives():
+def test_fraction_of_arrived_packets_is_duplicated():
     config = replace(ROUGH, burst=0.0)
     first, second = packet_delays(config, 0, FORWARD, MANY, PERIOD).T
     arrived = first >= 0
@@ -365,7 +365,7 @@ def test_duplicates_are_a_share_of_what_arrives():
 @given(st.floats(1.0, 3000.0))
 @example(1000.0)
 @example(290.0)
-def test_the_sender_keeps_to_the_rate_and_sends_evenly(rate):
+def test_sender_sends_evenly_at_the_configured_rate(rate):
     steps = 5000
     delays = packet_delays(NetworkConfig(rate_hz=rate), 0, FORWARD, steps, PERIOD)[:, 0]
     sent = np.flatnonzero(delays >= 0)
@@ -440,7 +440,7 @@ def test_packet_is_held_zero_or_extrapolated_during_silence(silence, silent):
         np.testing.assert_array_equal(received[part], packet[part])
 
 
-def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first():
+def test_packet_size_equals_that_of_the_neutral_packet():
     p = network_parameters(NetworkConfig(), 0, FORWARD, PERIOD)
     packets, received = random_packets(3), np.zeros(PACKET_SIZE)
     state = initial_network_state(p, np.zeros(PACKET_LOAD_WRENCH.start))
@@ -455,7 +455,7 @@ def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first()
 
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])
-def test_before_the_first_packet_there_are_zeros(silence):
+def test_output_is_zero_before_the_first_packet(silence):
     config = NetworkConfig(delay=0.05, silence=silence)
     received, newest, _ = exchange(config, random_packets())
     assert (newest[:50] == -1).all() and not received[:50].any()
@@ -469,7 +469,7 @@ def write_trace(path, text: str) -> NetworkConfig:
     return NetworkConfig(trace=str(path))
 
 
-def test_a_trace_is_played_as_recorded_and_starts_again(tmp_path):
+def test_trace_is_replayed_periodically(tmp_path):
     config = write_trace(
         tmp_path / "net.csv", "time,delay\n10.000,0.004\n10.002,\n10.003,0.0021\n10.005,0\n"
     )
@@ -541,7 +541,7 @@ def test_invalid_values_are_rejected(change, named):
         network_parameters(NetworkConfig(**change), 0, FORWARD, PERIOD)
 
 
-def test_it_loads_from_yaml():
+def test_config_is_loaded_from_yaml():
     text = "{delay: 0.1, distribution: gamma, rate_hz: 500, trace: net.csv, redundant: true}"
     loaded = yaml_load_typed(schema=NetworkConfig, data=text, defaults=NetworkConfig())
     expected = NetworkConfig(
