@@ -59,7 +59,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 
-def test_the_peg_is_the_tools_ball_and_another_of_its_size():
+def test_peg_is_two_balls_of_the_size_of_the_tool():
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = ParseSlave(plant).tool
     mass = plant.get_body(tool).default_mass()
@@ -77,7 +77,7 @@ def test_the_peg_is_the_tools_ball_and_another_of_its_size():
     assert plant.get_body(tool).default_mass() == mass
 
 
-def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
+def test_stand_reaches_from_the_ground_to_the_lowest_box():
     slot = Slot(position=[0.5, -0.2, 0.4], depth=0.03, chamfer=0.004, yaw=0.3)
     corners = np.array(list(product([-0.5, 0.5], repeat=3)))
     lowest = min(

@@ -155,7 +155,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
     assert len(touched) == 4  # with contact of the block and without
 
 
-def test_between_two_states_bodies_move_on_smoothly():
+def test_bodies_move_smoothly_between_two_states():
     """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
