@@ -141,7 +141,7 @@ def test_grasp_is_detected_and_the_object_identified(grasped):
 
 @pytest.mark.slow
 def test_estimate_changes_without_a_step(grasped):
-    """Between two loads nothing is eliminated; each sample moves the estimate by 1 %."""
+    """The load is zero between two loads; each sample changes the estimate by 1 %."""
     phi = grasped["load_estimate"][:, 6:]
     faded = phi[grasped.t < time_of(grasped, STATE_SETTLED, time_of(grasped, STATE_OTHER_LOAD))][-1]
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
