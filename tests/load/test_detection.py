@@ -382,7 +382,7 @@ def test_auc_of_two_normals():
 
 
 @given(arrays(np.float64, st.integers(1, 50), elements=st.floats(-9, 9)), st.floats(0.0, 0.9999))
-def test_a_threshold_from_free_motion_is_the_least_that_holds(free, share):
+def test_threshold_is_the_least_for_a_false_alarm_rate(free, share):
     threshold = free_threshold(free, share)
     assert (free >= threshold).mean() <= share
     assert (free >= np.nextafter(threshold, -np.inf)).mean() > share

@@ -189,7 +189,7 @@ def test_covariance_is_independent_of_the_units_of_the_wrench(unit, seed):
 @settings(max_examples=25, deadline=None)
 @given(R=rotations(), seed=st.integers(0, 1000))
 def test_identified_load_does_not_depend_on_the_axes(R, seed):
-    # With isotropic noise and white residuals; R turns the axes of S.
+    # Noise is isotropic and residuals are white; R rotates the axes of S.
     motion = rich_motion(600, seed)
     wrench = OFFSETS + non_contact_wrench(*motion, TOOL)
     std = np.repeat([0.3, 0.01], 3)
