@@ -23,7 +23,7 @@ PHI = phi_from_mass_com_inertia(
 OFFSETS = np.array([3.1, -1.4, 6.0, 0.13, -0.29, 0.06])
 TRUTH = np.concatenate([OFFSETS, PHI])
 GRAVITY_W = rotation_matrices(np.array([[0.4, -0.2, 0.0]]), "rotation_vector")[0] @ DOWN
-"""Tilted: turned about z and x only, gravity along z would never have an x in S."""
+"""Tilted: with rotations about z and x only, gravity along z would never have an x in S."""
 SECONDS, LATE = 20.0, 0.013
 SHIFT = np.array([0.02, -0.035, 0.15])
 TURN = rotation_matrices(np.array([[0.3, -0.2, 0.6]]), "rotation_vector")[0]

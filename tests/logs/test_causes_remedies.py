@@ -196,7 +196,7 @@ def displaced_imu() -> Record:
 
 
 def rotated() -> Record:
-    """Describe all motion in axes that are turned by `TURN`, the IMU's 5 cm from S."""
+    """Describe all motion in axes that are rotated by `TURN`, the IMU's 5 cm from S."""
     place = np.array([0.0, 0.03, 0.04])
     record = replace(Record.simulate(), turn=TURN @ OBLIQUE, imu_at=place)
     record.imu_lines = {"frame": OBLIQUE.tolist(), "position": (TURN.T @ place).tolist()}
@@ -252,7 +252,7 @@ def test_gravity_auto_finds_the_direction_and_states_it(degrees: float, tmp_path
 
 
 @pytest.mark.parametrize("seed", range(16))
-def test_lines_of_axes_factor_and_gain_compose_with_what_is_described(
+def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     seed: int, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -279,9 +279,7 @@ def test_lines_of_axes_factor_and_gain_compose_with_what_is_described(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_weight_is_added_back_and_a_pose_frame_to_that_described(
-    seed: int, tmp_path: Path
-) -> None:
+def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
     record = Record.simulate(seconds=4.0, noise=0.0)
     right, place = record.wrench.copy(), record.position.copy()

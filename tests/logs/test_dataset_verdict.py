@@ -78,7 +78,7 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
     ],
 )
-def test_each_deviation_has_its_price(change, count):
+def test_each_deviation_increases_the_cost(change, count):
     assert _weighted_number_of_faults(replace(PLAIN, **change), 2.0) == count
 
 

@@ -40,7 +40,7 @@ def test_low_pass_keeps_straight_lines_to_the_ends() -> None:
     np.testing.assert_allclose(low_pass(x, 1e-3, 20.0)[:, 0], 1, atol=1e-12)
 
 
-def test_low_pass_above_nyquist_or_none_changes_nothing() -> None:
+def test_low_pass_above_nyquist_has_no_effect() -> None:
     x = np.random.default_rng(1).normal(size=(50, 2))
     assert low_pass(x, 0.1, 30.0) is x
     assert low_pass(x, 0.1, None) is x

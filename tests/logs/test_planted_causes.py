@@ -62,7 +62,7 @@ def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
         ("none", "slow", "imu", 91),
     ],
 )
-def test_no_number_is_certain_and_wrong_where_the_cause_has_no_name(
+def test_no_number_is_significantly_wrong_without_a_named_cause(
     case: tuple[str, str, str, int],
 ) -> None:
     assert run_case(*case)["false"] == []

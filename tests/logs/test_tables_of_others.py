@@ -356,7 +356,7 @@ def test_units_at_the_end_of_names_are_drafted(tmp_path: Path) -> None:
     assert draft["pose"]["orientation"]["unit"] == "deg"
 
 
-def test_a_force_without_a_torque_is_said_not_to_suffice(tmp_path: Path) -> None:
+def test_force_without_torque_is_reported_as_incomplete(tmp_path: Path) -> None:
     columns = {"t": np.arange(60) * 0.01, **dict.fromkeys(["Fx", "Fy", "Fz"], np.ones(60))}
     pl.DataFrame(columns).write_csv(path := tmp_path / "x.csv")
     draft = draft_description(read_table(path), tmp_path)
@@ -514,7 +514,7 @@ def test_a_robot_learning_table_is_drafted(tmp_path: Path) -> None:
     assert found.mass == pytest.approx(PHI[0], abs=5e-3)
 
 
-def test_raw_counts_leave_the_scale_open(tmp_path: Path) -> None:
+def test_scale_of_raw_counts_is_a_placeholder(tmp_path: Path) -> None:
     names = dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
     frame = renamed(
         table(), {"t": "t", **names, **dict(zip(QUATERNION, ["qw", "qx", "qy", "qz"], strict=True))}
@@ -538,7 +538,7 @@ def test_a_short_table_without_time_has_poses_at_rest(tmp_path: Path) -> None:
     assert draft["static"]["orientation"]["columns"] == ["qw", "qx", "qy", "qz"]
 
 
-def test_offsets_come_from_the_untouched_time_or_the_load_file(tmp_path: Path) -> None:
+def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
     path = described(tmp_path, table())
     load = identify_log(path).identification
     t = pl.col("t")
