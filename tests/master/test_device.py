@@ -288,7 +288,7 @@ def test_hand_wrench_equals_its_joint_torque():
         np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
 
 
-# q2 = -124 and q3 = 214 degrees are beyond what the five-bar lets the other link reach.
+# q2 = -124 and q3 = 214 degrees are beyond the range of the other link in the five-bar.
 STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)]
 
 
