@@ -106,7 +106,7 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     task = Press(translation=[0.03, -0.02, -0.06])
     training = decision.OperatorTraining(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
     person = decision.pack_operator_parameters(training, Perception(), Movement())
-    # As Python, so that nothing else is compiled.
+    # In Python, to avoid compilation.
     monkeypatch.setattr(
         decision, "_contact_force_against_axis", decision._contact_force_against_axis.py_func
     )
