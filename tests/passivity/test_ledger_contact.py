@@ -192,7 +192,7 @@ def test_friction_opposes_a_hand_that_reverses_before_the_slave_does():
     """The slave slides 100 ms behind the hand, and meets the friction of its own motion."""
     hand, delay, speed = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0), 100, 5e-5
     hand.rest(1500)
-    ways = np.repeat([speed, -speed], [400, 60])  # short: the direction turns to the friction
+    ways = np.repeat([speed, -speed], [400, 60])  # short: the direction rotates to the friction
     for k, way in enumerate(ways):
         late = ways[k - delay] if k >= delay else 0.0
         hand.packet[POSE][5] += late
@@ -234,7 +234,7 @@ def test_friction_stays_across_the_direction_as_it_turns():
 
 @pytest.mark.parametrize(("round_trip", "lag"), [(0.01, 0.6), (0.1, 3.0), (0.3, 9.0)])
 def test_torque_across_the_contact_is_a_stiffer_spring_with_a_longer_lag(round_trip, lag):
-    """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction turns within 3 s."""
+    """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction rotates within 3 s."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = round_trip
     hand.rest(1500)
@@ -313,7 +313,7 @@ def test_released_hand_receives_at_most_its_ledger():
 
 @pytest.mark.parametrize("known", [0.0, 3e-5])
 def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder(known):
-    """A hand that oscillates by one encoder step needs a force on the way in as well."""
+    """A hand that oscillates by one encoder step needs a force on the inward step as well."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[known, 0.0])
     got, step = 0.0, 3e-5
     hand.memory[STORED_ENERGY] = 0.0
@@ -398,7 +398,7 @@ def test_balance_counts_the_measured_motion_within_the_lost_motion(known):
 
 
 def test_energy_limit_counts_a_measured_step_within_the_lost_motion():
-    """0.3 mJ remain: a hand that a known step of 50 um pushes back receives less at once."""
+    """Energy of 0.3 mJ remains: a hand that a step of 50 um pushes back receives less at once."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[5e-5, 0.0])
     full = hand.rest(1500)[2]
     hand.memory[STORED_ENERGY][0] = 0.05 * RICH.ledger.hand_reserve[0] + 3e-4

@@ -150,21 +150,21 @@ def test_result_is_independent_of_the_world_axes(method):
     )
     R = normalized_quaternion(tuple(rng.normal(size=4)))
 
-    def turned(vectors):
+    def rotated(vectors):
         return np.array([[*rotate_vector(R, v[:3]), *rotate_vector(R, v[3:6])] for v in vectors])
 
-    def turned_poses(x):
+    def rotated_poses(x):
         return np.array(
             [[*quaternion_product(R, tuple(row[:4])), *rotate_vector(R, row[4:])] for row in x]
         )
 
     wrench, command, *_ = run(method, config, master, slave, f_e, newest)
     wrench_R, command_R, *_ = run(
-        method, config, turned_poses(master), turned_poses(slave), turned(f_e), newest
+        method, config, rotated_poses(master), rotated_poses(slave), rotated(f_e), newest
     )
-    np.testing.assert_allclose(wrench_R, turned(wrench), atol=1e-8)
-    np.testing.assert_allclose(command_R[:, :7], turned_poses(command[:, :7]), atol=1e-9)
-    np.testing.assert_allclose(command_R[:, 7:], turned(command[:, 7:]), atol=1e-6)
+    np.testing.assert_allclose(wrench_R, rotated(wrench), atol=1e-8)
+    np.testing.assert_allclose(command_R[:, :7], rotated_poses(command[:, :7]), atol=1e-9)
+    np.testing.assert_allclose(command_R[:, 7:], rotated(command[:, 7:]), atol=1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)

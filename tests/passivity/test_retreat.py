@@ -39,7 +39,7 @@ def test_only_wrench_along_a_fast_hand_fades():
 
     def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
         memory, wrench = np.zeros(MEMORY_SIZE), given.copy()
-        fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
+        fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: no filtering
         wrench[:] = given
         fade_retreat_wrench(now, 1e-9, p, memory, wrench)
         np.testing.assert_array_equal(memory[LAST_WRENCH], wrench)

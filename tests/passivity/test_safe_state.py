@@ -50,8 +50,8 @@ def run(network: NetworkConfig, method: str, model: OneDof):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, method):
-    """The wall is held from 6.5 to 11.5 s; nothing arrives from 8 to 9 s."""
+def test_wrench_has_no_step_at_a_silence_in_contact(tmp_path, method):
+    """The hand presses from 6.5 to 11.5 s; no packet arrives from 8 to 9 s."""
     model = OneDof(wall_stiffness=1000.0)
     result = run(silent(tmp_path, [(8.0, 9.0)]), method, model)
     t, felt, command = result.t, result.hand_force, result.command_position
@@ -75,7 +75,7 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "tdpa"])
-def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
+def test_second_press_is_independent_of_an_earlier_silence(tmp_path, method):
     """The wall is pressed twice; the first time there is silence in the middle.
 
     TDPA is excluded: the force of its slave depends on the whole history of its ledgers.
@@ -101,7 +101,7 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_motion_during_silence_is_not_replayed(tmp_path, method):
-    """The hand swings from 0.5 to 3 s; nothing arrives from 1 to 2.5 s, while it swings."""
+    """The hand swings from 0.5 to 3 s; no packet arrives from 1 to 2.5 s."""
     result = run(silent(tmp_path, [(1.0, 2.5)]), method, OneDof())
     t = result.t
     # The speed is at most that of the hand plus that of the missed displacement on the ramp of the

@@ -101,7 +101,7 @@ def test_steady_position_error_is_the_momentum_on_the_line(delay):
 
 
 @pytest.mark.parametrize("delay", [1, 40])
-def test_a_line_that_filled_in_contact_holds_it(delay):
+def test_line_filled_in_contact_keeps_the_contact_force(delay):
     """5 N act before the line starts: the command stays, and 5 N are rendered."""
     f, x = line(WaveConfig(), np.zeros(400), lambda u, x: -5.0, delay, delay, fills=2 * delay + 100)
     assert np.abs(x).max() < 1e-12
