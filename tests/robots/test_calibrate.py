@@ -44,7 +44,7 @@ TOLERANCE = parse_tolerance("mass 0.5 %, com 0.5 mm")
 
 
 def motion(t: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotations about `axes` in turn, by 1 rad and back in one second each."""
+    """Return rotations about `axes` one after another, by 1 rad and back in one second each."""
     angle, k = 0.5 * (1.0 - np.cos(2 * np.pi * t)), np.floor(t).astype(int) % len(axes)
     e = np.eye(3)[axes[k]]
     speed, change = np.pi * np.sin(2 * np.pi * t), 2 * np.pi**2 * np.cos(2 * np.pi * t)

@@ -151,7 +151,7 @@ def test_invalid_and_out_of_order_poses_are_ignored() -> None:
         for k in range(300, 400)
         for each in assembly.readings_completed_by(wrench_at(k * DT, k), k * DT)
     ]
-    assert after == []  # as no more motions are known
+    assert after == []  # motion is unknown
 
 
 def test_assembly_accepts_a_clock_that_is_set_back() -> None:
