@@ -49,7 +49,7 @@ def outputs(
     return found
 
 
-def test_the_four_cases_of_section_v(arm):
+def test_four_cases_of_section_v_have_their_wrenches(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     for sigma in (0.0, 0.5, 1.0, 2.0):
         out = outputs(ForceScalingConfig(sigma=sigma), arm, contact)
@@ -128,7 +128,7 @@ def test_rendered_wrench_is_the_scaled_reaction(arm):
     assert np.linalg.norm(force_B) == pytest.approx(np.linalg.norm(force_S) / 17.5)
 
 
-def test_load_wrench_is_the_rest_beside_the_contact(arm):
+def test_load_wrench_is_the_output_minus_the_contact(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     touched = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
     assert not touched["load_wrench_B"].any()

@@ -66,7 +66,7 @@ def test_quaternion_sign_does_not_matter(pose, master, command, translation, ang
     flip = np.array([-1.0] * 4 + [1.0] * 3)
     difference = rotation(pose) @ rotation(master).T
     if np.trace(difference) < -0.999:
-        return  # at 180 degrees the shorter way round is undecided
+        return  # at 180 degrees the shorter rotation is ambiguous
     for other in (
         scale_pose(flip * pose, master, command, translation=translation, angle=angle),
         scale_pose(pose, flip * master, command, translation=translation, angle=angle),
