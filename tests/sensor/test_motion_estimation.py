@@ -326,7 +326,7 @@ def test_filter_errors_equal_the_predicted_deviations():
     gains = steady_state_kalman_gains(position_std, white, walk, T)
     random = np.random.default_rng(1)
     error = np.cumsum(walk * np.sqrt(T) * random.standard_normal((steps, 3)), axis=0)
-    # True acceleration zero: what is measured is error and noise, and rate and angle stay zero.
+    # The true acceleration is zero: measurements are error and noise; rate and angle stay zero.
     measured = -error + white * random.standard_normal((steps, 3))
     angle = position_std * random.standard_normal((steps, 3))
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []

@@ -386,7 +386,7 @@ def test_two_sensors_in_one_diagram_read_their_own_weld():
     assert diagram.HasSubsystemNamed("foot_sensor_noise")
 
 
-def test_no_sample_from_numbers_that_are_none():
+def test_input_not_finite_gives_no_sample():
     run = moving()
     run.simulator.AdvanceTo(1.5e-3)
     before = reading(run, "measured_wrench_S").copy()
@@ -475,6 +475,6 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_work_is_refused_with_its_reason(name):
+def test_error_states_the_reason_of_a_refused_call(name):
     change, expected = REFUSED[name]
     assert expected in refused(change)

@@ -102,7 +102,7 @@ def test_presets_are_plausible_and_settle_at_the_first_sample(name):
     config.check("sensor", RATE)
     truths = np.repeat(random_truths(1), 400, axis=0)
     found = readings(without_parts(config, *QUIET, "drift"), truths)
-    # The low-pass keeps what the converter rounded, so that it moves within a quantum.
+    # The low-pass stores rounded values, so that its output moves within a quantum.
     quantum = config.resolution * config.ranges()
     assert np.all(np.ptp(found[:, :12], axis=0) <= quantum)
     assert np.ptp(found[:, 12:], axis=0).max() == 0.0

@@ -69,7 +69,7 @@ def test_the_low_pass_is_a_fourth_order_butterworth(rate):
         assert abs(response(cutoff, rate, frequency)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_at_rest_it_reads_weight_and_offset():
+def test_reading_at_rest_is_weight_plus_offset():
     offset = [6.0, -3.0, 8.0, 0.3, -0.4, 0.1]
     result = at_rest(dataclasses.replace(QUIET, offset=offset))
     # S points down: Eq. (1) is -m g, which is m * 9.81 upwards, -z_S.
