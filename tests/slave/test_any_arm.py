@@ -152,7 +152,7 @@ def test_tool_from_mass_and_shapes():
     about_S = about_S + np.triu(about_S, 1).T + m * (c @ c * np.eye(3) - np.outer(c, c))
     expected = [m, *(m * c), *about_S[np.triu_indices(3)]]
     np.testing.assert_allclose(slave.arm.phi_load, expected, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(slave.tip, [0.0, 0.01, 0.13], atol=1e-15)  # half of 0.06, turned
+    np.testing.assert_allclose(slave.tip, [0.0, 0.01, 0.13], atol=1e-15)  # half of 0.06, rotated
     touching = AddSlavePlant(
         DiagramBuilder(), Slave(tool=Tool(mass=2.0, shapes=shapes[:1])), SheetSpring()
     )

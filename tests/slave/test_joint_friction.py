@@ -83,7 +83,7 @@ def test_joint_creeps_below_friction_torque(arm):
     arm.simulator.Initialize()
     arm.simulator.AdvanceTo(0.1)
     q, v = arm.state()
-    # Gravity's torque changes on the way, by N m a rad.
+    # Gravity's torque changes during the motion, by N m a rad.
     np.testing.assert_allclose(v, 2e-3 * np.arctanh(share), atol=3e-5)
     assert (np.abs(q - arm.slave.start) <= 0.1 * 2e-3 * np.arctanh(np.abs(share)) + 1e-5).all()
 

@@ -91,7 +91,7 @@ def test_frames_and_classes_of_included_files_apply(tmp_path):
     path = written(tmp_path, "<mujoco><include file='parts/arm.xml'/></mujoco>", "a.xml")
     _, model, said = read(path, "S")
     assert (model.lower, model.upper) == (-1.0, 2.0)
-    # The joint turns about the world's -x, through a point 0.1 m above the body's origin.
+    # The joint rotates about the world's -x, through a point 0.1 m above the body's origin.
     np.testing.assert_allclose(
         pose(model, [0.7])[:, 3], [1, 0.4 * np.sin(0.7), 0.1 + 0.4 * np.cos(0.7)], atol=1e-12
     )
@@ -297,7 +297,7 @@ def test_mass_of_a_mesh_that_is_not_convex(tmp_path, mode, expected):
     ],
 )
 def test_inertia_by_the_compiler(tmp_path, compiler, moments, expected):
-    """The joint turns about y."""
+    """The joint rotates about y."""
     inertial = f'<inertial pos="0 0.1 0" mass="1" diaginertia="{moments}"/>'
     text = mjcf(arm(inertial=inertial), f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")

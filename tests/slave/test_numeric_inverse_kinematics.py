@@ -304,7 +304,7 @@ def test_system_continues_from_last_command(rx90):
         assert np.all(np.abs(q - before) <= rx90.arm.velocity_limit * PERIOD * (1 + 1e-9))
         state = system.EvalUniquePeriodicDiscreteUpdate(context)
         context.SetDiscreteState(state)
-        # Once taken, the command stays what it was.
+        # The first command is kept.
         np.testing.assert_array_equal(command.Eval(context), q)
     np.testing.assert_allclose(q, goal, atol=1e-9)
     system.GetInputPort("joint_position").FixValue(context, np.full(6, np.nan))
@@ -312,7 +312,7 @@ def test_system_continues_from_last_command(rx90):
     context.SetTime(1.0)
     np.testing.assert_array_equal(command.Eval(context), q)
     assert status.Eval(context) == [IkStatus.BAD_POSE]
-    # From ports and states as from arrays: nothing is compiled for them alone.
+    # Ports, states and arrays share the compiled functions.
     assert len(follow_pose.signatures) == 1
 
 
