@@ -15,14 +15,14 @@ UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)
 
 
-def known(points):
-    """Linear in x, quadratic in y, with their product; independent of z."""
+def true_function(points):
+    """Function linear in x, quadratic in y, with their product; independent of z."""
     x, y, _ = points.T
     return 5 * x + np.sin(5 * y) + 3 * x * y
 
 
 def true_effects() -> list[np.ndarray]:
-    """Return the means of `known` over each fifth of each factor, minus the mean of all."""
+    """Return the means of `true_function` over each fifth of each factor, minus the mean of all."""
     middles = (EDGES[1:] + EDGES[:-1]) / 2 - 0.5
     bent = -np.diff(np.cos(5 * EDGES)) / 5 / np.diff(EDGES)
     return [6.5 * middles, bent - bent.mean() + 1.5 * middles, np.zeros(5)]
@@ -43,7 +43,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
     inside, plain, null = [], [], []
     for draw in range(200):
         points = qmc.Sobol(3, seed=np.random.default_rng(draw)).random_base2(6)
-        table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
+        table = true_function(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
         table = table + random.normal(0, noise, table.shape)
         known_there = ~(corner & (points[:, 0] > 0.6) & (points[:, 1] < 0.4))
         model = fit_level_model(UNIT, points.T.tolist(), known_there)
