@@ -104,7 +104,7 @@ def run_by_trial_number(folder: str) -> None:
 
 @pytest.mark.slow
 def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
-    code = "import sys; from test_procedure import goes_through; goes_through(sys.argv[1])"
+    code = "import sys; from test_procedure import run_by_trial_number; run_by_trial_number(sys.argv[1])"
     command = [sys.executable, "-c", code, str(tmp_path / "cut")]
     folder = Path(__file__).parent
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
