@@ -82,7 +82,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     assert len(cut.read_rows(3)) == len(plan_trials(SMALL, 3))
 
 
-def run_by_trial_number(folder: str) -> None:
+def run_numbered(folder: str) -> None:
     """Run a participant with answers by trial number, and print each trial."""
     with open_trial_store(Path(folder), SHORT) as store:
         procedure = Procedure(SHORT, 1, store)
@@ -104,7 +104,7 @@ def run_by_trial_number(folder: str) -> None:
 
 @pytest.mark.slow
 def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
-    code = "import sys; from test_procedure import run_by_trial_number; run_by_trial_number(sys.argv[1])"
+    code = "import sys; from test_procedure import run_numbered; run_numbered(sys.argv[1])"
     command = [sys.executable, "-c", code, str(tmp_path / "cut")]
     folder = Path(__file__).parent
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
@@ -115,8 +115,8 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     cut = TrialStore(tmp_path / "cut")
     left = len(cut.read_rows(1))
     assert message <= left < len(plan_trials(SHORT, 1))
-    run_by_trial_number(str(tmp_path / "cut"))
-    run_by_trial_number(str(tmp_path / "whole"))
+    run_numbered(str(tmp_path / "cut"))
+    run_numbered(str(tmp_path / "whole"))
     assert cut.read_rows(1) == TrialStore(tmp_path / "whole").read_rows(1)
 
 
