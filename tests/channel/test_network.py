@@ -247,7 +247,7 @@ MANY = 200_000
 
 @pytest.mark.parametrize("jitter", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
-def test_mean_spread_and_floor_of_the_delay(distribution, jitter):
+def test_delay_has_the_configured_mean_spread_and_floor(distribution, jitter):
     mean = 500  # steps, so that rounding to whole steps adds nothing
     config = NetworkConfig(delay=mean * PERIOD, jitter=jitter, distribution=distribution)
     delays = packet_delays(config, 1, FORWARD, MANY, PERIOD)[:, 0]
@@ -312,7 +312,7 @@ def runs_of(lost: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("burst", [0.0, 1e-3, 0.02])
 @pytest.mark.parametrize("loss", [0.01, 0.3, 0.9])
-def test_loss_and_mean_length_of_its_bursts(loss, burst):
+def test_loss_and_mean_burst_length_are_as_configured(loss, burst):
     config = NetworkConfig(loss=loss, burst=burst)
     lost = packet_delays(config, 4, FORWARD, MANY, PERIOD)[:, 0] < 0
     memory = math.exp(-PERIOD / (burst * (1 - loss))) if burst else 0.0
@@ -560,6 +560,6 @@ def test_config_is_loaded_from_yaml():
         (NetworkConfig(delay=0.05, jitter=0.5, loss=0.3, burst=0.08), network.BACKWARD, 0.49),
     ],
 )
-def test_the_longest_silence_of_a_minute(config, direction, longest):
+def test_longest_silence_in_a_minute_is_estimated(config, direction, longest):
     found = network.longest_silence(config, direction, 1e-3)
     assert found == pytest.approx(longest, rel=0.15 if config.burst else 1e-9)
