@@ -293,7 +293,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
+def test_pushed_block_resists_by_friction():
     """mu m g in steady sliding; the summary has the distance."""
     scenario = replace(LoadScenario("push_block"), wrist_sensor__ideal=True)
     estimate = true_load(scenario)
