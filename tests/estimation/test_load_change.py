@@ -74,7 +74,7 @@ def test_no_alarm_in_free_motion(tool):
 
 
 @pytest.mark.parametrize("keep", [1, 8])
-def test_a_grasp_at_8_and_at_1_khz(tool, keep):
+def test_grasp_is_detected_at_8_and_at_1_khz(tool, keep):
     """The given noise is that before the filter, at either rate."""
     for seed in range(3):
         states, load = monitor(tool, samples(seed, grasp=True)[::keep], keep / RATE)
