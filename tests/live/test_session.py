@@ -377,7 +377,7 @@ def test_incomplete_last_line_is_ignored(tmp_path):
     assert len(INPUT_RANGES) == 22
 
 
-def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):
+def test_weight_scale_is_separate_or_that_of_the_inertia_at_minus_one(scenario, load):
     apart = replace(scenario, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.25)
     assert (
         Inputs.from_scenario(scenario).sigma_weight == -1
