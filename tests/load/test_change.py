@@ -56,7 +56,7 @@ def test_motion_of_the_benchmark_is_a_body_motion(bench):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_free_motion_is_no_change(bench, tool):
+def test_free_motion_is_not_a_load_change(bench, tool):
     for seed in SEEDS:
         states = bench.monitor("JR3", tool).watch(*bench.record("JR3", seed))
         assert states.max() == KNOWN

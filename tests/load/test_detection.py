@@ -351,7 +351,7 @@ def test_only_the_push_is_contact_in_fast_motion():
     assert seen[0] > 0.5 > 5.0 * seen[1]
 
 
-def test_an_update_is_one_sample():
+def test_each_update_counts_one_sample():
     memory, floor = np.zeros(MEMORY_SIZE), white(0.5)
     for count in (1.0, 2.0):
         update_statistics(

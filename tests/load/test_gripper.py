@@ -87,7 +87,7 @@ def test_margin_distinguishes_possible_and_impossible_bodies() -> None:
     assert margin < -3 * deviation < 0
 
 
-def test_a_negative_mass_is_far_outside() -> None:
+def test_margin_of_a_negative_mass_is_far_below_zero() -> None:
     load = estimate(OBJECT, 1)
     margin, deviation = consistency_margin(replace(load, phi=-load.phi))
     assert margin < -0.5  # of four eigenvalues with the sum -2
