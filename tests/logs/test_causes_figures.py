@@ -87,7 +87,7 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     assert starts == sorted(starts) and {103.0, 105.0} <= set(starts)
 
 
-def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_before():
+def test_load_of_each_part_includes_the_uncertainty_of_earlier_changes():
     steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
     state = state_of(Model(steps=steps), values)

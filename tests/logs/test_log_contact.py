@@ -36,7 +36,7 @@ def detect(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) 
     return found
 
 
-def test_the_noise_floor_is_that_of_the_quiet_part() -> None:
+def test_noise_floor_excludes_contact() -> None:
     contact = noise_of(1)
     np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
     contact[3500:] += 5.0 + 3 * np.sin(np.linspace(0, 9, 2500))[:, None]

@@ -164,7 +164,7 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
 @pytest.mark.parametrize(
     ("plant", "motion", "name", "line"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]
 )
-def test_a_mistake_is_named(
+def test_planted_mistake_is_named(
     good: Columns,
     tmp_path: Path,
     plant: Callable[[Columns], None],

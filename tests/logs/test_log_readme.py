@@ -52,7 +52,7 @@ def test_only_finding_of_the_sample_is_the_lag_of_its_pose():
 
 
 @pytest.mark.slow
-def test_the_load_is_identified():
+def test_readme_commands_identify_the_load():
     truth, load = contents("out/sample/truth.json"), contents("out/load/identification.json")
     assert all(load["identifiable"])
     for name, value in {"mass": 5e-4, "com": 1e-4, "delay_s": 3e-4}.items():
