@@ -86,7 +86,7 @@ def test_intent_is_smooth_to_the_second_derivative():
     np.testing.assert_allclose(acceleration[0], 0, atol=1e-9)
 
 
-def test_segments_start_from_rest_and_add_up():
+def test_segments_start_from_rest_and_are_added():
     (first, last), twists = intent_at(SEGMENTS, START, [0.0, 2.0])
     np.testing.assert_array_equal(first, START)
     np.testing.assert_array_equal(twists, 0)
