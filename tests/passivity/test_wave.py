@@ -70,7 +70,7 @@ def motion():
 
 @pytest.mark.parametrize("delay", [1, 30, 500])
 @pytest.mark.parametrize("end", ["matched", "free", "rigid"])
-def test_closed_forms_of_the_line(motion, end, delay):
+def test_line_equals_its_closed_forms(motion, end, delay):
     """Z = b matched, b tanh(s T) free, b coth(s T) rigid: as exact recursions over the RTT."""
     b, n = 10.0, 2 * delay
     contact = {
