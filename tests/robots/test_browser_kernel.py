@@ -31,7 +31,7 @@ pytestmark = [
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="there is no node here")
-def test_bits_of_compensate_in_node(tmp_path):
+def test_kernel_in_node_has_the_bits_of_compensate(tmp_path):
     rows = kernel.readings(5000, seed=9)
     kernel.prepared(tmp_path, rows)
     found, _, size = kernel.in_node(tmp_path)

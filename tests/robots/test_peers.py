@@ -126,7 +126,7 @@ def free_port() -> str:
         return str(free.getsockname()[1])
 
 
-def test_udp() -> None:
+def test_udp_faults_are_flagged() -> None:
     source = UdpSource("udp://:0", 0.002)
     Compensator(load(), source.dt)  # loads compiled functions: the sender does not wait
     with peer("udp", str(source.port)):
@@ -144,7 +144,7 @@ def test_udp() -> None:
     assert numbers[numbers.index(12) - 1] == 8  # and no data instead of the lost packets
 
 
-def test_netft() -> None:
+def test_netft_faults_are_flagged() -> None:
     with peer("netft") as (port, _):
         source = NetFtSource(f"netft://127.0.0.1:{port}?counts=1000,1000&sign=1", 0.002)
         seen = LoopOutputs(source, 10)
@@ -162,7 +162,7 @@ def test_netft() -> None:
 
 
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
-def test_rtde() -> None:
+def test_rtde_faults_are_flagged() -> None:
     sockets.on_purpose.add(30004)  # of this machine, but not 127.0.0.1
     with peer("rtde", ADDRESS) as (host, _):
         source = RtdeSource(f"rtde://{host}?sign=1")
@@ -182,7 +182,7 @@ def test_rtde() -> None:
     ]
 
 
-def test_ros_2() -> None:
+def test_ros_2_faults_are_flagged() -> None:
     with peer("ros", free_port()) as (port, _):
         source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
         seen = LoopOutputs(source, 510, ReadingFlag.CLOCK_JUMP)
@@ -249,7 +249,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])
-def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: bool) -> None:
+def test_netft_with_another_rate_has_only_the_rate_flag(real_hz: float, named: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=1,1&rate=1000&sign=1")
     compensator, flags = Compensator(load(), source.dt), []
     for k in range(round(2.5 * real_hz)):
@@ -268,9 +268,7 @@ def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: 
      (1 << 31 | 1, ReadingFlag.DAMAGED),
      (1 << 17, ReadingFlag.SATURATED), (1 << 31 | 1 << 17, ReadingFlag.SATURATED)],
 )  # fmt: skip
-def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
-    status: int, flag: int, still: bool
-) -> None:
+def test_netft_status_and_repeated_samples_are_flagged(status: int, flag: int, still: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
     counts = [2, -4, 6, 4, -8, 12]
     source.part_of_packet(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)

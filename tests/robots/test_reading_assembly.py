@@ -115,7 +115,7 @@ def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
         open_source("udp://:0", weightless, rate_hz=500.0)
 
 
-def test_two_clocks() -> None:
+def test_motion_on_another_clock_is_synchronised() -> None:
     apart = ReadingAssembler(PartStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
     same = ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
