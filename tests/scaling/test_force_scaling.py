@@ -58,7 +58,7 @@ def test_four_cases_of_section_v_have_their_wrenches(arm):
         np.testing.assert_allclose(out["scaled_wrench_S"], expected, atol=1e-12)
 
 
-def test_gamma_scales_the_contact_alone(arm):
+def test_gamma_scales_only_the_contact(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     out = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
     np.testing.assert_allclose(out["scaled_wrench_S"], 3 * contact, atol=1e-12)

@@ -171,7 +171,7 @@ def test_clutch_holds_the_command_and_re_indexes_without_a_jump():
     np.testing.assert_allclose(path[1200, 4:] - start[4:], moved, atol=1e-12)
 
 
-def test_the_clutch_waits_for_a_pose():
+def test_clutch_requires_a_valid_pose():
     """An invalid pose would stay the reference."""
     system = KinematicScaling(KinematicScalingConfig(), 1e-3, np.arange(1.0, 8.0))
     context = system.CreateDefaultContext()
