@@ -241,7 +241,7 @@ def test_wrench_and_motion_are_in_phase(source, preset, frequency):
     assert np.abs(lateness[strong] - delay).max() < 0.05
 
 
-def test_the_delays_add_up():
+def test_total_delay_is_the_sum_of_delays():
     sensor = dataclasses.replace(
         JR3, force_latency=1e-3, acceleration_latency=3e-3, encoder_latency=2e-3
     )
@@ -290,7 +290,7 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
 @settings(max_examples=60)
 @example(-6.0, -2.0, 0.0, 1e-2)
 @given(st.floats(-7, -3), st.floats(-3, 1), st.floats(-4, 2), st.sampled_from([T, 1e-3, 1e-2]))
-def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period):
+def test_gains_equal_those_of_the_kalman_filter(position, acceleration, drift, period):
     position_std, white, walk = 10.0**position, 10.0**acceleration, 10.0**drift
     found = steady_state_kalman_gains(position_std, white, walk, period)
     # In samples and standard deviations of the position.

@@ -188,7 +188,7 @@ def test_low_pass_is_a_butterworth_with_settled_start(place):
     np.testing.assert_allclose(found, expected, 1e-9, 1e-9)
 
 
-def test_the_place_of_the_low_pass_decides_what_it_filters():
+def test_low_pass_filters_only_the_effects_before_it():
     truths, noise = np.repeat(random_truths(1), 300, axis=0), random_noise(300)
     raw = part(force_noise=0.2, resolution=1e-3)
     unfiltered = readings(raw, truths, noise)
@@ -277,7 +277,7 @@ def test_saturation_clips_and_flags_with_latency_of_its_path():
 
 
 @pytest.mark.parametrize("low_pass", ["none", "before_noise", "after_converter"])
-def test_the_offset_counts_in_the_saturation(low_pass):
+def test_saturation_includes_the_offset(low_pass):
     """150 N with an offset of 60 N exceed the range of 200 N, with -60 N they do not."""
     truths = np.zeros((400, 15 + JOINTS))
     truths[:, 0] = 150.0
@@ -315,7 +315,7 @@ def test_overload_including_offset_is_not_plausible():
 
 @given(late=st.lists(st.integers(0, 40), min_size=3, max_size=3), joints=st.integers(1, 7))
 @settings(max_examples=25, deadline=None)
-def test_each_path_is_late_by_its_whole_samples(late, joints):
+def test_latency_of_each_path_is_in_whole_samples(late, joints):
     force, acceleration, encoders = late
     config = part(
         force_latency=(force + 0.4) * PERIOD,
@@ -331,7 +331,7 @@ def test_each_path_is_late_by_its_whole_samples(late, joints):
     np.testing.assert_array_equal(found, np.take_along_axis(expected, rows, axis=0))
 
 
-def test_the_ideal_sensor_is_never_late():
+def test_ideal_sensor_has_no_latency():
     config = dataclasses.replace(PRESETS["ati_gamma_imu"], ideal=True)
     assert not config.reading_delays(PERIOD).any() and not config.latency_samples(PERIOD).any()
     place, axes = config.accelerometer_pose()

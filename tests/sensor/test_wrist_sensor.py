@@ -105,7 +105,7 @@ def test_channels_are_independent_and_other_seeds_give_other_noise():
 
 
 @pytest.mark.slow
-def test_the_converter_quantises_before_the_filter():
+def test_converter_quantises_before_the_filter():
     """The reading at rest is a whole number of quanta."""
     result = at_rest(dataclasses.replace(QUIET, resolution=2.5e-4))
     force = result["measured_wrench_S"][-1, 2] / (2.5e-4 * 400.0)
