@@ -197,7 +197,7 @@ LIMIT = 'lower="-2.2" upper="2.2"'
         ("prismatic", 'lower="0.2"', (0.2, 2.2), "a range of 2 m"),
     ],
 )
-def test_limits_of_a_joint(kind, limit, expected, words):
+def test_limits_of_a_joint_are_read_or_assumed(kind, limit, expected, words):
     text = urdf(SEVEN).replace('"j2" type="revolute"', f'"j2" type="{kind}"')
     arm, assumed = arm_of(text.replace(LIMIT, limit, 1))
     assert (arm.lower[1], arm.upper[1]) == pytest.approx(expected)
