@@ -142,7 +142,7 @@ def two_runs(monkeypatch):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
+def test_commands_and_code_of_the_docs_run(two_runs, tmp_path, monkeypatch):
     """Each study has two runs."""
     monkeypatch.chdir(tmp_path)
     docs = Path(__file__).parents[2] / "docs"
