@@ -21,7 +21,8 @@ FILES = sorted(
 )
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
-    *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But"),
+    *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But", "Against", "In"),
+    *("Along", "Within", "Over", "Beyond", "After", "Then", "Among", "Neither", "There", "Its"),
 }
 """A docstring begins with a verb or a noun phrase; exceptions: "Whether" of
 properties, and questions of benchmarks."""

@@ -87,7 +87,7 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
-    """Along the parameter other than delay, at whole periods of delay."""
+    """The parameter other than delay varies by 1 %, at whole periods of delay."""
     axis, sampling, found = drawn
     x, y = found.boundary.T
     moved, fixed = (found.y_name, found.x) if found.x_name != "sigma" else (found.x_name, found.y)

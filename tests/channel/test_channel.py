@@ -107,7 +107,7 @@ def test_ideal_network_without_method_changes_no_signal(channel):
 
 
 def test_ports_contain_the_work_of_the_hand(load_estimate):
-    """Against the same sum over the logged force and motion of the stylus itself."""
+    """Compare with the sum over the logged force and motion of the stylus."""
     result = run(moving(channel__delay=0.01), load_estimate)
     force, twist = result["force_to_master"], result["pose_command"][:, 4:]
     work = np.cumsum(np.sum(force[:-1, :3] * np.diff(twist, axis=0), axis=1))

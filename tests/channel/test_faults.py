@@ -164,7 +164,7 @@ def test_last_valid_wrench_is_rendered_while_the_sensor_is_saturated():
 
 @pytest.mark.parametrize("method", ["two_layer", "pspm"])
 def test_motor_ledger_uses_the_command_after_the_safe_state(method):
-    """In the safe state and while it ends, this differs from the method's command."""
+    """The command in the safe state and at its end differs from that of the method."""
     found = run(method, "hand_wrench")
     t = found.t
     changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME_S)

@@ -154,7 +154,7 @@ def test_boxes_fill_the_section(yaw, chamfer, clearance, depth, x, y, z):
 
 
 def test_walls_tops_and_floor_end_flush():
-    """There is no contact beyond the end of a block."""
+    """Blocks have no contact beyond their ends."""
     pairs = pairs_of_a_ball(Slot(position=[0.0, 0.0, 0.0]))
     level = np.all(pairs[:, 4:13].round(12) == np.eye(3).ravel(), axis=1)  # all but the chamfers
     assert np.count_nonzero(level) == 5

@@ -58,7 +58,7 @@ SOFT_PAD = """
 
 
 def test_walls_and_boxes_follow_drakes_contact_law():
-    """In a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
+    """The ball is in a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
     corner = SeveralObjects(
         [
             Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),

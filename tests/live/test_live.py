@@ -150,7 +150,7 @@ def test_new_scene_starts_a_drive_with_its_own_folder(scenario, load, clock, tmp
 
 @pytest.mark.slow
 def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, monkeypatch):
-    """Neither by a new drive or a reset, nor in a folder with other files."""
+    """A new drive, a reset and a folder with other files keep earlier records."""
     monkeypatch.chdir(tmp_path)
     before: dict[Path, bytes] = {}
     (tmp_path / "mine").mkdir()

@@ -102,7 +102,7 @@ def test_signals_are_continuous_when_inputs_change(driven, scenario):
 @pytest.mark.long
 @pytest.mark.slow
 def test_new_network_and_method_continue_the_state(scenario, load):
-    """In contact, to another channel and back; the rendered wrench cross-fades."""
+    """The channel changes in contact and back; the rendered wrench cross-fades."""
     session = Session(scenario, load)
     now = session.inputs.with_changes({"z": -2900})
     for end, change in ((250, {}), (1050, {"network": 2, "method": 4}), (1400, {"network": 0})):

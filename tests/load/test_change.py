@@ -165,7 +165,7 @@ def test_object_grasped_at_rest_is_identified_in_motion(bench, tool):
 
 
 def test_load_is_identified_in_slow_motion_with_noisy_alpha(bench, tool):
-    """In slow motion alpha is mostly noise, which makes estimated inertias too small."""
+    """Noise dominates alpha in slow motion, and makes estimated inertias too small."""
     t, clean, up = bench.motion(8)
     turn = 0.6 * np.sin(0.8 * t)
     rate, change = 0.48 * np.cos(0.8 * t), -0.384 * np.sin(0.8 * t)

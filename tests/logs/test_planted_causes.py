@@ -69,7 +69,7 @@ def test_no_number_is_significantly_wrong_without_a_named_cause(
 
 
 def test_a_slow_record_of_an_imu_gives_mass_and_centre(tmp_path: Path) -> None:
-    """Its angular acceleration is mostly noise, which is no misfit."""
+    """Noise of the angular acceleration is not a misfit."""
     record = make_record("none", "slow", "imu", 31)
     found = identify_log(write(record, tmp_path)).identification
     assert found.identifiable.tolist() == [True] * 10 + [False] * 6

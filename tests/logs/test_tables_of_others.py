@@ -183,7 +183,7 @@ def test_a_partly_filled_row_is_still_an_error(tmp_path: Path) -> None:
 
 
 def test_row_numbers_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
-    """This includes a stream with rows of its own."""
+    """One stream has rows of its own."""
     wrench = table().select("t", *FORCE, *TORQUE)
     pose = table().select("t", *POSITION, *QUATERNION)
     pose = pose.with_columns(q0=pl.when(pl.col("t") == 1.0).then(7.0).otherwise(pl.col("q0")))

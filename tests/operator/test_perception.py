@@ -74,7 +74,7 @@ def test_inertial_force_of_the_hand_is_not_perceived():
 
 
 def test_masking_fades_with_its_time_constant():
-    """After a motion the threshold decays as exp(-t / masking_time)."""
+    """The threshold decays as exp(-t / masking_time) after a motion."""
     force, velocity = record(1.2, 0.0, 0.0, 0.1)
     moving = (T < 4.0)[:, np.newaxis]
     felt = perceive_contact(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)

@@ -228,7 +228,7 @@ def test_operator_gives_up_without_contact():
 @pytest.mark.long
 @pytest.mark.slow
 def test_set_force_is_held():
-    """There is no device friction, which hides 1 N at the tool."""
+    """Device friction, which hides 1 N at the tool, is zero."""
     smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
     task = Press(translation=[0.0, 0.0, -0.08], force=12.0, tolerance=1.2)
     _, measures = run("press", **with_task(task, **smooth), force_scaling__gamma=1.6)

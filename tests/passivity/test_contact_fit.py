@@ -49,7 +49,7 @@ def test_stiffness_and_damping_are_not_negative():
 
 
 def test_slip_is_excluded_from_stiffness_and_a_hit_stop_is_not():
-    """Up to 0.12 N over 0.2 mm belong to the spring, and at most 0.4 N to friction."""
+    """Forces up to 0.12 N over 0.2 mm belong to the spring, and at most 0.4 N to friction."""
     for sign in (1.0, -1.0):
         assert sign * force_change_by_slip(sign * 0.1, sign * 0.12, 0.4) == 0.0
         assert sign * force_change_by_slip(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)

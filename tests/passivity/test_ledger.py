@@ -225,7 +225,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     ],
 )
 def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
-    """There is no initial energy and no information about the hand."""
+    """The ledger has no initial energy and no information about the hand."""
     task = Task(
         press_start=3.5,
         press_end=4.5,

@@ -167,7 +167,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
-    """In the 0.5 s after a silence, with the paper's wall, where several methods chatter."""
+    """The wrench is that of 0.5 s after a silence at the paper's wall, where methods chatter."""
     resumptions = 0
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method)

@@ -159,7 +159,7 @@ def test_energy_that_fills_a_line_counts_once():
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
 def test_wrench_rate_is_bounded_after_missing_packets(missing):
-    """In contact with a moving hand: at most 450 N/s instead of 1 to 7 N in a step."""
+    """A moving hand in contact receives at most 450 N/s instead of 1 to 7 N in a step."""
     pressed, begin = 0.01 * (1.0 - np.cos(np.arange(600) * T / 0.15)), 150
     f, _ = line(
         WaveConfig(),

@@ -261,7 +261,7 @@ def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
 def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error) -> None:
-    """This includes an interrupt while rows are written."""
+    """Interrupts may occur while rows are written."""
     failing, path = FailingSink(lines.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:

@@ -209,7 +209,7 @@ def test_arms_with_other_numbers_of_joints(source, joints):
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("frequency", [5.0, 20.0])
 def test_wrench_and_motion_are_in_phase(source, preset, frequency):
-    """Within a fiftieth of a sample, and within a twentieth of the stated delay.
+    """The difference is within a fiftieth of a sample and a twentieth of the stated delay.
 
     Source `encoders` has a low-pass whose phase exceeds its delay by 0.1 samples at 5 Hz
     and 1.6 at 20 Hz.
@@ -313,7 +313,7 @@ def test_gains_equal_those_of_the_kalman_filter(position, acceleration, drift, p
 
 
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
-    """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
+    """White noise only: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
     gains = steady_state_kalman_gains(position_std, acceleration_std, 1e-3, T)
     crossover = np.sqrt(acceleration_std / position_std)

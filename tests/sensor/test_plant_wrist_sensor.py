@@ -270,7 +270,7 @@ def test_a_weld_from_tool_to_arm_gives_the_wrench_on_the_tool():
 
 @pytest.mark.parametrize("off", ["gripper", "arm"])
 def test_specific_force_has_no_gravity_if_the_tool_has_none(off):
-    """Then V phi equals the wrench nevertheless."""
+    """V phi equals the wrench with and without gravity."""
     run = moving(without_gravity=off)
     run.simulator.AdvanceTo(1e-4)
     wrench = reading(run, "measured_wrench_S")
