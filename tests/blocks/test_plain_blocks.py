@@ -453,7 +453,7 @@ def test_a_script_sets_and_reads_state_parameters_and_inputs(name):
         port = block.get_input_port(k)
         port.FixValue(context, 0.1 * np.arange(port.size()))
         np.testing.assert_array_equal(port.Eval(context), 0.1 * np.arange(port.size()))
-    assert vectors or name == "WrenchScaling"  # whose only settings are those of its constructor
+    assert vectors or name == "WrenchScaling"  # all settings are in the constructor
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -248,7 +248,7 @@ MANY = 200_000
 @pytest.mark.parametrize("jitter", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
 def test_delay_has_the_configured_mean_spread_and_floor(distribution, jitter):
-    mean = 500  # steps, so that rounding to whole steps adds nothing
+    mean = 500  # steps, to avoid rounding to whole steps
     config = NetworkConfig(delay=mean * PERIOD, jitter=jitter, distribution=distribution)
     delays = packet_delays(config, 1, FORWARD, MANY, PERIOD)[:, 0]
     std = jitter * mean / math.sqrt(3)

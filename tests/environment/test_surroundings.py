@@ -326,7 +326,7 @@ def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
     scenario = replace(Scenario(), environment=[Block(), door])
     turned = RollPitchYaw(0.1, -0.2, 0.5).ToQuaternion().wxyz()
     opened = RollPitchYaw(0.0, 0.0, 0.7 + 0.6).ToQuaternion().wxyz()
-    # The hinge stays where it is.
+    # The hinge does not move.
     p_DoorHinge = np.array([0.01, 0.02, 0.03])
     closed, open_ = (RotationMatrix(RollPitchYaw(0.0, 0.0, yaw)) for yaw in (0.7, 1.3))
     place = np.array([0.4, 0.3, 0.1]) + closed @ p_DoorHinge - open_ @ p_DoorHinge

@@ -78,7 +78,7 @@ def test_closed_page_releases_the_hand_and_completes_the_record(scenario, load, 
     assert len(again.t) == len(log.t)
     np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
 
-    # The next page takes the stylus where it is.
+    # The next page continues from the current pose.
     live.join(2, clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["driver"], frame["state"], frame["inputs"]["held"]) == (2, "running", 1)
@@ -169,7 +169,7 @@ def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, 
     live = make(scenario, load, clock, Path("."))
     assert live.frame()["record"] == str(tmp_path / "drive-5")
     live.close()
-    assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # it never began
+    assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # the drive has not begun
 
 
 def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):

@@ -323,7 +323,7 @@ def test_turntable_determines_sums_of_parameters():
     assert base.num_combinations == np.linalg.matrix_rank(rows, tol=1e-9 * np.linalg.norm(rows))
     assert set(base.parameters_without_influence) == {"I_xx", "I_xy", "I_yy"}
     coefficients = np.array([c.coefficients for c in base.combinations])
-    # No combination changes along the null space, and its estimate is the truth's.
+    # Combinations are constant along the null space, and their estimates are right.
     _, singular, vectors = np.linalg.svd(rows)
     null = vectors[(singular > 1e-9 * singular[0]).sum() :]
     np.testing.assert_allclose(coefficients @ null.T, 0.0, atol=1e-5)

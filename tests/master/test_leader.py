@@ -98,7 +98,7 @@ def test_motion_equals_drakes_plant_of_the_file():
         push.p_BoBq_B = frame.GetFixedPoseInBodyFrame().translation()
         push.F_Bq_W = SpatialForce(hand[3:], hand[:3])
         plant.get_applied_spatial_force_input_port().FixValue(context, [push])
-        # The leader's own damping, which it adds to the model's.
+        # The leader adds its own damping to that of the model.
         for joint in map(plant.get_joint, plant.GetJointIndices()):
             if joint.num_velocities():
                 joint.SetDampingVector(context, joint.default_damping_vector() + 0.01)

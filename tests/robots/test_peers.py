@@ -45,7 +45,7 @@ from drake_teleop.robots.udp import UdpSource
 
 PEER = Path(__file__).with_name("peer.py")
 AT_REST = np.array([0.0, 0.0, 9.81, *np.zeros(6)])
-ADDRESS = f"127.{os.getpid() // 250 % 250}.{os.getpid() % 250}.7"  # ur_rtde has but one port
+ADDRESS = f"127.{os.getpid() // 250 % 250}.{os.getpid() % 250}.7"  # ur_rtde has only one port
 LOST = {9, 10, 11}
 OFFSETS = np.array([0.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 

@@ -192,7 +192,7 @@ def test_an_ideal_sensor_is_not_corrected(source, fast):
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("joints", [2, 4, 7])
 def test_arms_with_other_numbers_of_joints(source, joints):
-    # A chain stays one if links at its base are left out, or repeated.
+    # Links at the base may be removed or repeated without breaking the chain.
     rows = np.r_[np.zeros(max(joints - 6, 0), int), np.arange(max(6 - joints, 0), 7)]
     arm = dataclasses.replace(ARM, table=ARM.table[rows])
     t = np.arange(6000) * T
@@ -299,8 +299,8 @@ def test_gains_equal_those_of_the_kalman_filter(position, acceleration, drift, p
     Q = np.outer(noise, noise)
     Q[2, 2] = (walk * period**2.5 / position_std) ** 2
     gains = found * [1, period, period**2]
-    # The gains are a fixed point of the Riccati equation: the covariance of the filter that has
-    # them, a linear equation, gives them back.
+    # The gains are a fixed point of the Riccati equation: they follow from the covariance of
+    # their own filter, a linear equation.
     A = (np.eye(3) - gains[:, None] * h) @ F
     N = (np.eye(3) - gains[:, None] * h) @ Q @ (np.eye(3) - gains[:, None] * h).T
     N += np.outer(gains, gains)

@@ -137,7 +137,7 @@ def compare(run, tolerance, instants, period=1e-3):
     largest = 0.0
     after = run.plant.time_step() > 0 and run.plant.has_sampled_output_ports()
     for k in instants:
-        if k > 0:  # else Drake handles the events of the present instant already
+        if k > 0:  # otherwise Drake handles the events of the present instant
             run.simulator.AdvanceTo(k * period)
         poses = [frame.CalcPoseInWorld(run.context) for frame in (run.S, run.weld.frame_on_child())]
         positions = run.plant.GetPositions(run.context)

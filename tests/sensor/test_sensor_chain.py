@@ -391,8 +391,8 @@ def test_allan_deviation_at_rest_equals_prediction(records, name):
     predicted = predicted_allan_deviation(AT_REST[name], lengths, PERIOD)
     noisy = predicted[:, 0] > 0
     assert noisy.any() and found[~noisy].max(initial=0.0) < 1e-9
-    # Of differences that do not overlap, which the estimate is better than; for white noise, which
-    # is the worse of the two.
+    # Deviation of differences without overlap, an upper bound of that of the estimate; for white
+    # noise, the worse of the two.
     deviation = np.sqrt(0.75 / (LONG / lengths - 1))
     assert np.all(np.abs(found[noisy] / predicted[noisy] - 1) <= 5 * deviation)
 

@@ -181,7 +181,7 @@ def test_joint_speed_stays_within_limits_at_singular_wrist(rx90, aside):
     def numeric(pose, reference):
         return follow(rx90, pose, reference, max_step=arm.velocity_limit * PERIOD)
 
-    assert sweep(rx90, start, closed)[0] > 20  # it is a singularity that is crossed
+    assert sweep(rx90, start, closed)[0] > 20  # the motion crosses a singularity
     largest, errors, statuses = sweep(rx90, start, numeric)
     assert largest < 1 + 1e-9
     assert max(errors) < 1e-5  # the rest is slow
