@@ -29,7 +29,7 @@ EXPERIMENT = Experiment(
 )
 
 
-class Person:
+class Participant:
     """Participant with a clock who presses in each interval."""
 
     def __init__(self, folder) -> None:
@@ -79,7 +79,7 @@ class Person:
 @pytest.mark.long
 @pytest.mark.slow
 def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
-    person = Person(tmp_path)
+    person = Participant(tmp_path)
     person.send(answer=1)  # not in the phase of an answer
     person.begin()
     person.send(set={"z": -1500, "sigma": 300, "gamma": 0})
@@ -106,7 +106,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
 
 @pytest.mark.slow
 def test_trial_restarts_after_the_page_is_closed(tmp_path):
-    person = Person(tmp_path)
+    person = Participant(tmp_path)
     person.begin()
     person.send(set={"z": -1500})
     person.wait("gap")

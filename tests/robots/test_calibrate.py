@@ -98,7 +98,7 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     assert last.record_length_s == pytest.approx(identify_log(path).log.t[-1])
 
 
-class Live(Stream):
+class FailingStream(Stream):
     """Live stream that ends with an error."""
 
     live = True
@@ -114,9 +114,9 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
     path = tmp_path / ReadingRecorder.log_file_name
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-            calibrate(Live(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
+            calibrate(FailingStream(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(Live(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # no data
+        calibrate(FailingStream(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # no data
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2

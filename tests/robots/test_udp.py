@@ -290,7 +290,7 @@ def test_live_source_keeps_earlier_files(tmp_path, name, monkeypatch) -> None:
         assert len(table_of(tmp_path / name)) == 30
 
 
-class Interrupted:
+class InterruptedSource:
     """Source with one reading, followed by Ctrl-C."""
 
     dt, live = DT, True
@@ -308,13 +308,13 @@ class Interrupted:
 
 
 def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert compensate_stream(Interrupted(), Compensator(load(), DT), open_sink("-")) == {
+    assert compensate_stream(InterruptedSource(), Compensator(load(), DT), open_sink("-")) == {
         "wrenches": 1
     }
     assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
-class SignalLost(Interrupted):
+class SignalLosingSource(InterruptedSource):
     """Source of which C code loses the KeyboardInterrupt of a signal."""
 
     def __init__(self, number: signal.Signals) -> None:
@@ -339,14 +339,14 @@ def handlers() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handlers")
 def test_loop_ends_at_a_signal_whose_exception_is_lost() -> None:
-    source = SignalLost(signal.SIGTERM)
+    source = SignalLosingSource(signal.SIGTERM)
     assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
 
 
 def test_loop_of_a_program_ends_at_ctrl_c_whose_exception_is_lost() -> None:
     with hearing_ctrl_c():
         for _ in range(2):
-            source = SignalLost(signal.SIGINT)
+            source = SignalLosingSource(signal.SIGINT)
             assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {
                 "wrenches": 1
             }
