@@ -334,7 +334,7 @@ def analyse(axis: OneAxis, omega: Array) -> None:
     absolute_stability.scattering_norm(S)
     absolute_stability.structured_singular_value(S)
     hands, walls = absolute_stability.impedance_range_of_grips(), WALL_RANGE
-    absolute_stability.can_oscillate(H, omega, hands, walls)
+    absolute_stability.stiffness_limit(H, omega, hands)
     absolute_stability.bounded_singular_value(H, omega, hands, walls)
     loop = cut_loop(axis, JR3)
     delay_margin(loop)

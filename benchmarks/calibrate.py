@@ -40,7 +40,7 @@ from drake_teleop.load.tolerance import (
     tolerances_in_units,
 )
 from drake_teleop.robots.calibration import RecordEvaluation, calibrate
-from drake_teleop.robots.recording import ReadingRecorder
+from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Reading
 
 Array = NDArray[np.float64]
@@ -177,7 +177,7 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
         if name == "poses":
             stream, keeps = posed(rng, phi, SECONDS)
         else:
-            stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), ReadingRecorder()
+            stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), Recorder()
         looks = calibrate(stream, keeps, folder / keeps.log_file_name, tolerance)
         for at in looks:
             if at.identified_log is not None:

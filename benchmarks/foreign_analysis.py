@@ -36,11 +36,11 @@ from drake_teleop.lab.analysis.analyze import (
     close_other_directions,
     sampling_of_scenario,
 )
-from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
 from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, stiffest_stable_walls
-from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
+from drake_teleop.lab.analysis.linear_model import Linearization
+from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances
 from drake_teleop.lab.identification import slave_arm
@@ -182,11 +182,11 @@ def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> fl
 def predicted(axis: OneAxis, stiffness: float, share: float, sampling: Sampling) -> float:
     """Return that ratio for the slowest motion of one axis."""
     scale = share * axis.force_scale
-    loop = cut_loop(
+    loop = closed_axis_model(
         dataclasses.replace(axis, wall_stiffness=stiffness, force_scale=scale), sampling
     )
-    multiplier = abs(complex(dominant_multiplier(loop, axis.delay)))
-    return float(f"{multiplier ** ((_LAST - _FIRST) / float(loop.period_s)):.3g}")
+    multiplier = abs(loop.multipliers[0])
+    return float(f"{multiplier ** ((_LAST - _FIRST) / loop.dt):.3g}")
 
 
 def slowest(scenario: Scenario, system: Linearization) -> dict[str, float]:

@@ -37,7 +37,7 @@ from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
 from drake_teleop.live.record import SessionRecord, versions_and_file_digest
 from drake_teleop.robots import lines
-from drake_teleop.robots.recording import ReadingRecorder
+from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import CompensatedWrench, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
@@ -228,7 +228,7 @@ def recorded(path: Path) -> None:
     """Check that the longest run of readings on one clock is kept, except for its first second."""
     parts, step = _fields(path, parts=_STAMPS[0], step=5e-3)
     step = min(max(abs(step), 1e-4), 0.9) if np.isfinite(step) else 5e-3
-    recorder, longest = ReadingRecorder(), 0.0
+    recorder, longest = Recorder(), 0.0
     for k, part in enumerate(parts):
         start, count = (part if isinstance(part, list) and len(part) == 2 else (0.0, 1))[:2]
         start = start if isinstance(start, (int, float)) else float("nan")

@@ -13,12 +13,12 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import PartStreams, ReadingAssembler
+from drake_teleop.robots.assembly import ReadingAssembler, ReadingStreams
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
 from drake_teleop.robots.ros2_messages import MESSAGE_TYPE_OF_TOPIC
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
-from drake_teleop.robots.rtde import parts_of_sample
+from drake_teleop.robots.rtde import readings_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import (
     IMU,
@@ -26,7 +26,6 @@ from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
     POSE,
     WRENCH,
-    Part,
     Reading,
 )
 
@@ -91,7 +90,7 @@ class _Told:
     def __init__(self, *streams: str) -> None:
         self.streams = streams
 
-    def read(self, timeout_s: float) -> list[Part]:
+    def read(self, timeout_s: float) -> list[Reading]:
         return []
 
     def close(self) -> None:
@@ -103,12 +102,12 @@ def netft_wrenches(path: Path) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=1000,1000&rate=500", None)
     still = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0])
 
-    def parts() -> Iterator[Part]:
+    def parts() -> Iterator[Reading]:
         for k, packet in enumerate(_pieces(path.read_bytes(), RECORD_FORMAT.size)):
-            yield Part(IMU, k, DT * k, still)
-            yield source.part_of_packet(packet, DT * k)
+            yield Reading(k, DT * k, still, stream=IMU)
+            yield source.reading_of_packet(packet, DT * k)
 
-    _checked(ReadingAssembler(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
+    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
@@ -120,9 +119,9 @@ def rtde_wrenches(path: Path) -> None:
         if len(each) == SAMPLE_FORMAT.size
     ]
     parts = (
-        part for each in whole for part in parts_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
+        part for each in whole for part in readings_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
     )
-    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), parts)
+    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH, POSE))), parts)
 
 
 _SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPE_OF_TOPIC}
@@ -135,18 +134,18 @@ def ros_wrenches(path: Path) -> None:
     while content:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
-            parts += _MESSAGES.parts_of_cdr(name, message[:-_SENT], message[-_SENT:])
-    _checked(ReadingAssembler(PartStreams(_Told(WRENCH, POSE))), iter(parts))
+            parts += _MESSAGES.readings_of_cdr(name, message[:-_SENT], message[-_SENT:])
+    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:
     return [content[k : k + size] for k in range(0, len(content), size)]
 
 
-def _checked(assembly: ReadingAssembler, parts: Iterator[Part]) -> None:
+def _checked(assembly: ReadingAssembler, parts: Iterator[Reading]) -> None:
     compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
     for k, part in enumerate(parts):
-        found: list[Reading] = assembly.readings_completed_by(part, DT * k / 3)
+        found: list[Reading] = assembly.readings_completed_by(part._replace(arrival=DT * k / 3))
         for reading in found:
             out = compensator.step(reading, DT * k / 3)
             numbers = np.array([out.t, *out.contact, *out.scaled])

@@ -13,9 +13,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import PartStreams
-from drake_teleop.robots.recording import PartRecorder
-from drake_teleop.robots.streams import POSE, WRENCH, Part
+from drake_teleop.robots.recording import Recorder
+from drake_teleop.robots.streams import POSE, WRENCH, Reading
 
 Array = NDArray[np.float64]
 
@@ -61,41 +60,25 @@ class Hand:
         return np.asarray(R.inv().apply(a + UP)), omega_at(t), alpha
 
 
-class Told:
-    """Source without data that lists its streams."""
-
-    dt = 1.0 / HZ
-
-    def __init__(self, *streams: str) -> None:
-        self.streams = streams
-
-    def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
-        return None
-
-    def close(self) -> None:
-        """See `PartSource`."""
-
-
 class Played:
-    """Source that delivers parts without waiting, each with its time of arrival."""
+    """Source that delivers readings without waiting, each with its time of arrival."""
 
     live = False
 
-    def __init__(self, parts: list[tuple[Part, float]]) -> None:
-        self._parts, self._at = sorted(parts, key=lambda part: part[1]), 0
+    def __init__(self, parts: list[Reading]) -> None:
+        self._parts, self._at = sorted(parts, key=lambda part: part.arrival), 0
 
-    def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
-        """See `Parts`."""
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
         start, self._at = self._at, self._at + 96
         return self._parts[start : self._at] or None
 
     def close(self) -> None:
-        """See `Parts`."""
+        """See `Source`."""
 
 
-def posed(rng: np.random.Generator, phi: Array, seconds: float) -> tuple[Played, PartRecorder]:
-    """Return the parts of a load's record, and their recorder."""
+def posed(rng: np.random.Generator, phi: Array, seconds: float) -> tuple[Played, Recorder]:
+    """Return the readings of a load's record, and their recorder."""
     hand = Hand(rng)
     t, late = np.arange(round(seconds * HZ)) / HZ, rng.uniform(0.0, 0.008)
     a = rng.choice(COLOURS)
@@ -114,9 +97,11 @@ def posed(rng: np.random.Generator, phi: Array, seconds: float) -> tuple[Played,
     poses = np.hstack([R_WF.as_quat()[:, [3, 0, 1, 2]], p_WF])
     two = bool(rng.integers(2))
     clock, ways = CLOCK_S * two, rng.exponential(4e-4, (2, len(t))).clip(0.0, 2e-3)
-    parts = [(Part(WRENCH, k, t[k], row), t[k] + ways[0, k]) for k, row in enumerate(wrench)]
+    parts = [
+        Reading(k, t[k], row, stream=WRENCH, arrival=t[k] + ways[0, k])
+        for k, row in enumerate(wrench)
+    ]
     for k, row in enumerate(poses):
-        stamp = taken[k] + late + clock
-        parts.append((Part(POSE, k, stamp, row), taken[k] + late + ways[1, k]))
-    told = PartStreams(Told(WRENCH), Told(POSE)) if two else PartStreams(Told(WRENCH, POSE))
-    return Played(parts), PartRecorder(told, None, X_FS)
+        stamp, arrival = taken[k] + late + clock, taken[k] + late + ways[1, k]
+        parts.append(Reading(k, stamp, row, stream=POSE, arrival=arrival))
+    return Played(parts), Recorder((WRENCH, POSE), None, X_FS, two_clocks=two)

@@ -98,14 +98,14 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
     began: list[float] = []
     writes: list[int] = []
     spent: list[list[float]] = []
-    parts_of = MessageConverter.parts_of_message
+    parts_of = MessageConverter.readings_of_message
 
     def noted(self: Any, name: str, data: Any, number: int) -> Any:
         if not began:
             began[:] = time.perf_counter(), time.thread_time()
         return parts_of(self, name, data, number)
 
-    MessageConverter.parts_of_message = noted  # type: ignore[method-assign]
+    MessageConverter.readings_of_message = noted  # type: ignore[method-assign]
     with ExitStack() as stack:
         sink = open_sink(f"ros2://contact?domain={DOMAIN}")
         source = open_source(SOURCE, load, rate_hz=ECHO_HZ)

@@ -1,30 +1,16 @@
-"""Sampled one-axis station with its delay as registers: eigenvalues without the cut loop."""
+"""Eigenvalues of the sampled one-axis station with its delay as registers."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import (
-    RECEIVED_FORCE,
-    SAMPLED_FORCE,
-    Sampling,
-    delay_in_hand_periods,
-    period_map_of_cut_loop,
-)
+from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model
 
 
 def closed_map(axis: OneAxis, sampling: Sampling) -> np.ndarray:
     """Return the matrix of the closed loop over a hand period; registers delay the force."""
-    M, registers = period_map_of_cut_loop(axis, sampling), 2 * delay_in_hand_periods(axis, sampling)
-    n = len(M) - 3
-    closed = np.zeros((n + registers, n + registers))
-    closed[:n, :n] = M[:n, :n]
-    source = n + registers - 1 if registers else SAMPLED_FORCE
-    closed[:n, source] += M[:n, RECEIVED_FORCE]
-    for k in range(registers):
-        closed[n + k, n + k - 1 if k else SAMPLED_FORCE] = 1.0
-    return closed
+    return closed_axis_model(axis, sampling).with_delays_as_states().A
 
 
 def multipliers(axis: OneAxis, sampling: Sampling) -> np.ndarray:

@@ -13,10 +13,10 @@ from drake_teleop.lab.analysis.absolute_stability import (
     impedance_range_of_grips,
     required_damping,
     stiffness_limit,
-    worst_loads,
 )
 from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
-from drake_teleop.lab.analysis.linearization import COMPONENT_NAMES, hybrid_along, linearize
+from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES
+from drake_teleop.lab.analysis.linearization import hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
@@ -122,13 +122,6 @@ def test_lacking_damping_and_stiffness_limit_of_the_grips(diagrams):
     assert required_damping(H).max() == pytest.approx(float(damping), rel=0.01)
     (limit,) = re.findall(r"at\swalls\sup\sto\s([\d.]+) kN/m", TEXT)
     softest = stiffness_limit(H, omega, impedance_range_of_grips()).min()
-    ((mass, wall),) = re.findall(
-        r"at\s10 Hz\sa\shand\sof\s([\d.]+) kg\sat\sa\swall\sof\s([\d.]+) MN", TEXT
-    )
-    at = int(np.argmin(np.abs(omega - 20 * np.pi)))
-    worst = worst_loads(H[at])
-    assert worst.hand_reactance / omega[at] == pytest.approx(float(mass), rel=0.05)
-    assert -worst.environment_reactance * omega[at] == pytest.approx(1e6 * float(wall), rel=0.05)
     assert softest == pytest.approx(1e3 * float(limit), rel=0.01)
 
 

@@ -24,6 +24,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
 from drake_teleop.robots.export import export_load
+from drake_teleop.robots.lines import JsonLineSource
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import ENVIRONMENTS, LoadScenario, Scenario, ScenarioFromData
@@ -161,11 +162,11 @@ def test_export_source_and_sink_by_their_registered_names(folder):
     wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
     found = identify_batch(wrench, s, omega, alpha, method="data_sheet").identification
     assert export_load(found, "kilograms")[0] == "3.000\n"
-    sink, source = object(), object()
+    sink, source = object(), JsonLineSource(0, 0.002)
     SINKS.register("serial", lambda address: sink)
-    SOURCES.register("serial", lambda address, dt: (source, dt))
+    SOURCES.register("serial", lambda address, rate_hz, joints: source)
     assert open_sink("serial://tty0") is sink
-    assert open_source("serial://tty0", None, rate_hz=500.0) == (source, 0.002)
+    assert open_source("serial://tty0", None, rate_hz=500.0) is source
     SINKS.remove("serial")
     with pytest.raises(
         DrakeTeleopError, match=r"serial://tty0: is not the address of a sink; give .*udp://"

@@ -26,10 +26,7 @@ from drake_teleop.load.tolerance import (
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
 
-_PROGRESS_CELLS, _PROGRESS_DECADES = (
-    24,
-    3.0,
-)  # decades of half-width over tolerance in a bar
+_PROGRESS_CELLS, _PROGRESS_DECADES = 24, 3.0  # of a bar; of half-width over tolerance
 
 
 def calibrate_command(

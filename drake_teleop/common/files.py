@@ -65,8 +65,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write indented JSON; non-finite numbers become null."""
-    write_text(path, json.dumps(_replace_nonfinite_numbers(data), indent=2, allow_nan=False) + "\n")
+    """Write indented JSON; arrays become lists, and non-finite numbers null."""
+    write_text(path, json.dumps(to_json_data(data), indent=2, allow_nan=False) + "\n")
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
@@ -160,11 +160,14 @@ def _reason_of_failure(error: OSError) -> str:
     return error.strerror or str(error) or type(error).__name__
 
 
-def _replace_nonfinite_numbers(data: Any) -> Any:
+def to_json_data(data: Any) -> Any:
+    """Return data with lists in place of arrays and tuples, and None in place of nan and inf."""
     if isinstance(data, dict):
-        return {key: _replace_nonfinite_numbers(value) for key, value in data.items()}
+        return {key: to_json_data(value) for key, value in data.items()}
+    if hasattr(data, "tolist"):  # of NumPy
+        data = data.tolist()
     if isinstance(data, (list, tuple)):
-        return [_replace_nonfinite_numbers(value) for value in data]
+        return [to_json_data(value) for value in data]
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 

@@ -5,11 +5,17 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
+
+from drake_teleop.common.files import write_picture, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def render_page(package: str, template: str, **values: Any) -> str:
@@ -34,6 +40,19 @@ def render_page(package: str, template: str, **values: Any) -> str:
 
 def png_data_url(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def write_report_page(
+    out: Path, package: str, pictures: Mapping[str, Figure], **values: Any
+) -> None:
+    """Write NAME.png for each picture, and report.html, which has their data URLs as `pictures`."""
+    from drake_teleop.common.style import PAGE_DPI
+
+    for name, figure in pictures.items():
+        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
+    urls = {name: png_data_url(out / f"{name}.png") for name in pictures}
+    page = render_page(package, "report.html.j2", pictures=urls, **values)
+    write_text(out / "report.html", page)
 
 
 _SCRIPT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)

@@ -21,6 +21,12 @@ def vector_at(x, i):
 
 
 @register_jitable
+def quaternion_at(x, i):
+    """Return the 4 numbers of x from index i as a quaternion [w, x, y, z]."""
+    return x[i], x[i + 1], x[i + 2], x[i + 3]
+
+
+@register_jitable
 def matrix_at(x, i):
     """Return the 9 numbers of x from index i as a rotation matrix."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]

@@ -84,13 +84,8 @@ class DeviceGuard:
         self._force_limit = min(
             self._force_limit + _FORCE_LIMIT_RISE_AFTER_SILENCE_N_S * period, self._limits.force
         )
-        return (
-            min(
-                max((COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_S), 0.0), 1.0
-            )
-            if age < COMMAND_TIMEOUT_S
-            else 0.0
-        )
+        share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_S)
+        return min(max(share, 0.0), 1.0) if age < COMMAND_TIMEOUT_S else 0.0
 
     def _limit_returned_energy(self, force: Array, next_motion: Array) -> Array:
         distance, available = math.hypot(*next_motion), self._stored_energy - _STORED_ENERGY_KEPT_J

@@ -135,11 +135,9 @@ class DeviceLink:
         """Return packet rate [Hz], lost packets, lateness and delays [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
-        elapsed = (
-            min(now - self._connected_at, 1e-3 * _LINK_STATISTICS_PACKETS)
-            if len(self._latencies) > 1
-            else np.inf
-        )
+        elapsed = np.inf
+        if len(self._latencies) > 1:
+            elapsed = min(now - self._connected_at, 1e-3 * _LINK_STATISTICS_PACKETS)
         return {
             "rate_hz": float(len(late) / max(elapsed, 1e-3)),
             "late_p99_ms": float(1e3 * (np.percentile(late, 99) - late.min())),

@@ -19,11 +19,14 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
+    quaternion_at,
     quaternion_exponential,
     quaternion_logarithm,
     quaternion_product,
+    scale_vector,
+    vector_at,
 )
-from drake_teleop.live.station_swap import add_cross_fade
+from drake_teleop.live.station_swap import finish_master_side
 from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
@@ -39,14 +42,8 @@ POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # largest slew rate [1/s].
 _WRENCH_LIMIT_FADE_S, _WRENCH_LIMIT_RETURN_PER_S, _RELATIVE_WRENCH_SLEW_PER_S = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
-(
-    _HELD_INDEX,
-    _START_TIME_INDEX,
-    _START_POSE_INDEX,
-    _DISPLACEMENT_INDEX,
-    _ROTATION_INDEX,
-    _PATH_SIZE,
-) = 0, 1, 2, 9, 12, 15
+_HELD_INDEX, _START_TIME_INDEX, _START_POSE_INDEX = 0, 1, 2
+_DISPLACEMENT_INDEX, _ROTATION_INDEX = 9, 12
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT_INDEX, _ALLOWED_SHARE_INDEX, _DISPLAY_STATE_SIZE = 6, 7, 8
 _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
@@ -55,18 +52,8 @@ _WRENCH_FAULT_NUMBER = float(Fault.WRENCH)
 @njit(cache=True)
 def _pose_and_twist_on_path_into(path, time, out):
     share = min(max((time - path[_START_TIME_INDEX]) / POSE_PERIOD_S, 0.0), 1.0)
-    r = (
-        share * path[_ROTATION_INDEX],
-        share * path[_ROTATION_INDEX + 1],
-        share * path[_ROTATION_INDEX + 2],
-    )
-    start = (
-        path[_START_POSE_INDEX],
-        path[_START_POSE_INDEX + 1],
-        path[_START_POSE_INDEX + 2],
-        path[_START_POSE_INDEX + 3],
-    )
-    rotation = quaternion_product(quaternion_exponential(r), start)
+    r = scale_vector(share, vector_at(path, _ROTATION_INDEX))
+    rotation = quaternion_product(quaternion_exponential(r), quaternion_at(path, _START_POSE_INDEX))
     moves = 1.0 / POSE_PERIOD_S if share < 1.0 else 0.0
     for k in range(4):
         out[k] = rotation[k]
@@ -123,12 +110,7 @@ class ExternalMaster(LeafSystem):
 
     def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
-        path = np.zeros(_PATH_SIZE)
-        path[_HELD_INDEX], path[_START_TIME_INDEX], path[_START_POSE_INDEX:_DISPLACEMENT_INDEX] = (
-            1.0,
-            -POSE_PERIOD_S,
-            start,
-        )
+        path = np.array([1.0, -POSE_PERIOD_S, *start, *np.zeros(6)])
         self._path = self.DeclareNumericParameter(BasicVector(path))
         self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
@@ -148,19 +130,11 @@ class ExternalMaster(LeafSystem):
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
         """Interpolate the device's X_BE to `target` (7,) over 2 ms; None releases the device."""
-        now, path = self._current_pose_and_twist(context), np.zeros(_PATH_SIZE)
-        path[_START_TIME_INDEX], path[_START_POSE_INDEX:_DISPLACEMENT_INDEX] = (
-            context.get_time(),
-            now[:7],
-        )
+        now, held, motion = self._current_pose_and_twist(context)[:7], 0.0, np.zeros(6)
         if target is not None:
-            path[_HELD_INDEX], path[_DISPLACEMENT_INDEX:_ROTATION_INDEX] = (
-                1.0,
-                target[4:] - now[4:7],
-            )
-            path[_ROTATION_INDEX:] = quaternion_logarithm(
-                quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
-            )
+            turn = quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
+            held, motion = 1.0, np.append(target[4:] - now[4:], quaternion_logarithm(turn))
+        path = [held, context.get_time(), *now, *motion]
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
@@ -227,12 +201,5 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
         "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
     )
     builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
-    wrench = master.GetInputPort("wrench_command")
-    if cross_fade:
-        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
-    builder.ExportInput(wrench, "wrench_command")
-    builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
     export_outputs(builder, inner_side, "pose_command")
-    for index in range(master.num_output_ports()):
-        export_outputs(builder, master, master.get_output_port(index).get_name())
-    return builder.Build()
+    return finish_master_side(builder, master, inner_side, 1 / scenario.rates.hand_hz, cross_fade)

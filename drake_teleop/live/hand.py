@@ -23,13 +23,14 @@ from drake_teleop.common.vectors import (
     copy_into,
     cross,
     plus,
+    quaternion_at,
     quaternion_exponential,
     quaternion_logarithm,
     quaternion_product,
     scale_vector,
     vector_at,
 )
-from drake_teleop.live.station_swap import add_cross_fade
+from drake_teleop.live.station_swap import finish_master_side
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (
     HandImpedance,
@@ -38,7 +39,6 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.wiring import export_outputs
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
@@ -50,15 +50,9 @@ _GRIP_CHANGE_POLE_RAD_S = _ROTATION_POLE_RAD_S = 2 * math.pi * 5.0
 TARGET_LEAD_TIME_S = 2.5 / _TRANSLATION_POLE_RAD_S
 # Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
 # target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
-(
-    _HELD_INDEX,
-    _START_TIME_INDEX,
-    _POLE_INDEX,
-    _TARGET_POSE_INDEX,
-    _TARGET_OFFSET_INDEX,
-    _ROTATION_INDEX,
-    _PATH_SIZE,
-) = 0, 1, 2, 3, 10, 19, 25
+_HELD_INDEX, _START_TIME_INDEX, _POLE_INDEX, _TARGET_POSE_INDEX, _PATH_SIZE = 0, 1, 2, 3, 25
+_OFFSET_INDEX, _VELOCITY_INDEX, _ACCELERATION_INDEX = 10, 13, 16
+_ROTATION_INDEX, _RATE_INDEX = 19, 22
 _INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
@@ -75,26 +69,20 @@ def _intended_motion_into(path, time, pose, out):
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
         # x = (a + b t + c t^2) e^(-w t), and its derivatives
-        a, v = path[_TARGET_OFFSET_INDEX + k], path[_TARGET_OFFSET_INDEX + 3 + k]
+        a, v = path[_OFFSET_INDEX + k], path[_VELOCITY_INDEX + k]
         b = v + w * a
-        c = 0.5 * (path[_TARGET_OFFSET_INDEX + 6 + k] + w * (b + v))
+        c = 0.5 * (path[_ACCELERATION_INDEX + k] + w * (b + v))
         x = a + t * (b + t * c)
         slope = b + 2.0 * c * t
         out[4 + k] = path[_TARGET_POSE_INDEX + 4 + k] + x * decay
         out[7 + k] = (slope - w * x) * decay
         out[13 + k] = (2.0 * c - w * (2.0 * slope - w * x)) * decay
-        turning = path[_ROTATION_INDEX + 3 + k] + _ROTATION_POLE_RAD_S * path[_ROTATION_INDEX + k]
-        r[k] = (path[_ROTATION_INDEX + k] + turning * t) * turning_decay
-        rate[k] = (
-            path[_ROTATION_INDEX + 3 + k] - _ROTATION_POLE_RAD_S * turning * t
-        ) * turning_decay
-    target = (
-        path[_TARGET_POSE_INDEX],
-        path[_TARGET_POSE_INDEX + 1],
-        path[_TARGET_POSE_INDEX + 2],
-        path[_TARGET_POSE_INDEX + 3],
-    )
-    orientation = quaternion_product(quaternion_exponential((r[0], r[1], r[2])), target)
+        turn, turn_rate = path[_ROTATION_INDEX + k], path[_RATE_INDEX + k]
+        turning = turn_rate + _ROTATION_POLE_RAD_S * turn
+        r[k] = (turn + turning * t) * turning_decay
+        rate[k] = (turn_rate - _ROTATION_POLE_RAD_S * turning * t) * turning_decay
+    target = quaternion_at(path, _TARGET_POSE_INDEX)
+    orientation = quaternion_product(quaternion_exponential(vector_at(r, 0)), target)
     for k in range(4):
         out[k] = orientation[k]
     # omega = rate + a r x rate + b r x (r x rate)
@@ -128,13 +116,11 @@ def _start_path_into(path, time, now, target, poles):
     copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
     rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
     rate = _rotation_vector_rate(rotation, vector_at(now, 10))
+    copy_into(path, _VELOCITY_INDEX, now, 7, 3)
+    copy_into(path, _ACCELERATION_INDEX, now, 13, 3)
     for k in range(3):
-        path[_TARGET_OFFSET_INDEX + k], path[_TARGET_OFFSET_INDEX + 3 + k] = (
-            now[4 + k] - target[4 + k],
-            now[7 + k],
-        )
-        path[_TARGET_OFFSET_INDEX + 6 + k] = now[13 + k]
-        path[_ROTATION_INDEX + k], path[_ROTATION_INDEX + 3 + k] = rotation[k], rate[k]
+        path[_OFFSET_INDEX + k] = now[4 + k] - target[4 + k]
+        path[_ROTATION_INDEX + k], path[_RATE_INDEX + k] = rotation[k], rate[k]
 
 
 @njit(cache=True, borrows=True)
@@ -167,11 +153,8 @@ class LiveHand(Operator):
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
-        path[_HELD_INDEX], path[_POLE_INDEX], path[_TARGET_POSE_INDEX:_TARGET_OFFSET_INDEX] = (
-            1.0,
-            _TRANSLATION_POLE_RAD_S,
-            self._intent[1],
-        )
+        path[_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
+        path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
@@ -179,13 +162,8 @@ class LiveHand(Operator):
         """Start a smooth path to the pose X_BE `target` (7,); None releases the stylus."""
         path = np.zeros(_PATH_SIZE)
         if target is not None:
-            _start_path_into(
-                path,
-                context.get_time(),
-                self._current_motion(context),
-                target,
-                _TRANSLATION_POLE_RAD_S,
-            )
+            now = self._current_motion(context)
+            _start_path_into(path, context.get_time(), now, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
@@ -195,28 +173,20 @@ class LiveHand(Operator):
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._current_motion(context)
-        rotation = np.array(
-            quaternion_logarithm(
-                quaternion_product(tuple(intention[:4]), conjugate_quaternion(tuple(pose[:4])))
-            )
-        )
-        rotation *= before.rotational_stiffness / after.rotational_stiffness
+        intended, now = tuple(intention[:4]), tuple(pose[:4])
+        rotation = quaternion_logarithm(quaternion_product(intended, conjugate_quaternion(now)))
+        share = before.rotational_stiffness / after.rotational_stiffness
         displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
-        damping = np.repeat(
-            [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
-            3,
-        )
-        intention[:4] = quaternion_product(quaternion_exponential(tuple(rotation)), tuple(pose[:4]))
+        translation_share = before.damping / after.damping
+        rotation_share = before.rotational_damping / after.rotational_damping
+        damping = np.repeat([translation_share, rotation_share], 3)
+        turn = quaternion_exponential(scale_vector(share, rotation))
+        intention[:4] = quaternion_product(turn, now)
         intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
-        _start_path_into(
-            path,
-            context.get_time(),
-            intention,
-            path[_TARGET_POSE_INDEX:_TARGET_OFFSET_INDEX].copy(),
-            _GRIP_CHANGE_POLE_RAD_S,
-        )
+        target = path[_TARGET_POSE_INDEX:_OFFSET_INDEX].copy()
+        _start_path_into(path, context.get_time(), intention, target, _GRIP_CHANGE_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def _current_motion(self, context: Context) -> Array:
@@ -246,11 +216,4 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
     side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
-    wrench = side.GetInputPort("wrench_command")
-    if cross_fade:
-        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
-    builder.ExportInput(wrench, "wrench_command")
-    builder.ExportInput(side.GetInputPort("clutch"), "clutch")
-    for index in range(side.num_output_ports()):
-        export_outputs(builder, side, side.get_output_port(index).get_name())
-    return builder.Build()
+    return finish_master_side(builder, side, side, 1 / scenario.rates.hand_hz, cross_fade)

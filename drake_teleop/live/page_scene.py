@@ -8,16 +8,16 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.errors import to_one_line
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.replay_file import silence_drake_log
 from drake_teleop.station.scenario import Scenario
 
-LogRows = dict[str, NDArray[np.float64]]
+LogRows = dict[str, Array]
 
 _SCENE_FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
@@ -70,7 +70,7 @@ class PageScene:
 
 class _SceneChangeRecorder:
     def __init__(self) -> None:
-        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._poses: dict[str, Array] = {}
         self._sizes: dict[str, list[float]] = {}
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:

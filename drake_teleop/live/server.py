@@ -254,10 +254,8 @@ class LiveDrive:
     async def _change_scene(self) -> None:
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
-        scenario, show = (
-            self._scene_scenarios[live.requested_scene],
-            self._views[live.requested_scene].frame_part,
-        )
+        scenario = self._scene_scenarios[live.requested_scene]
+        show = self._views[live.requested_scene].frame_part
 
         def identify() -> None:
             try:

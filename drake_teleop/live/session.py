@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
@@ -107,7 +107,7 @@ class _Station:
     def __init__(
         self,
         scenario: Scenario,
-        estimate: NDArray[np.float64] | None,
+        estimate: Array | None,
         load: IdentifiedLoad | None,
         number: int,
         *,
@@ -135,8 +135,8 @@ class _Station:
         block = inner_side.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
         return block, block.GetMyMutableContextFromRoot(self.context)
 
-    def signal_value(self, signal: str) -> NDArray[np.float64]:
-        values: NDArray[np.float64] = self.station.GetOutputPort(signal).Eval(self.context).copy()
+    def signal_value(self, signal: str) -> Array:
+        values: Array = self.station.GetOutputPort(signal).Eval(self.context).copy()
         return values
 
     def set_clutch(self, closed: bool) -> None:
@@ -269,7 +269,7 @@ class Session:
         # The same product as Drake's event times, see `simulate`.
         advance_without_garbage_collection(self._station.simulator, 1e-3 * ms)
 
-    def new_rows(self) -> dict[str, NDArray[np.float64]]:
+    def new_rows(self) -> dict[str, Array]:
         """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s]."""
         sink, start = self._station.sink, self._rows_read
         data, times = sink.data()[:, start:].T.copy(), sink.sample_times()[start:]
@@ -294,7 +294,7 @@ class Session:
         """Return the inputs of a hand that takes the stylus at its present pose."""
         return self.inputs.with_hand_at_pose(self._station.signal_value("pose_master"), self._start)
 
-    def device_wrench(self) -> NDArray[np.float64]:
+    def device_wrench(self) -> Array:
         """Return the wrench (6,) for the haptic device [N, N m]."""
         return self._station.signal_value("force_to_master")
 

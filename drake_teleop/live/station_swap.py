@@ -12,7 +12,6 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     DiscreteValues,
-    InputPort,
     LeafSystem,
     System,
 )
@@ -20,6 +19,7 @@ from pydrake.systems.framework import (
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
+from drake_teleop.station.wiring import export_outputs
 
 #: Blocks whose parameters change during a live session.
 _BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
@@ -93,10 +93,20 @@ def _force_norm(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
-def add_cross_fade(builder: DiagramBuilder, port: InputPort, period: float) -> InputPort:
-    block = builder.AddNamedSystem("cross_fade", CrossFade(period))
-    builder.Connect(block.get_output_port(), port)
-    return block.get_input_port()
+def finish_master_side(
+    builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
+) -> Diagram:
+    """Export the ports of a master side, with a block `CrossFade` on request, and build it."""
+    wrench = master.GetInputPort("wrench_command")
+    if cross_fade:
+        block = builder.AddNamedSystem("cross_fade", CrossFade(period))
+        builder.Connect(block.get_output_port(), wrench)
+        wrench = block.get_input_port()
+    builder.ExportInput(wrench, "wrench_command")
+    builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
+    names = [master.get_output_port(index).get_name() for index in range(master.num_output_ports())]
+    export_outputs(builder, master, *names)
+    return builder.Build()
 
 
 class CrossFade(LeafSystem):

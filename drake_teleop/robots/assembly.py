@@ -35,10 +35,9 @@ from drake_teleop.robots.streams import (
     NUM_READING_VALUES,
     POSE,
     WRENCH,
-    Part,
-    PartSource,
     Reading,
     ReadingFlag,
+    Source,
 )
 from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, white_wrench_noise
 
@@ -150,12 +149,10 @@ _MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # 
 _MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
-class PartStreams:
-    """Source of wrenches and motions, from one or two sources of parts."""
+class ReadingStreams(Source):
+    """Source of wrenches and motions, from one or two sources."""
 
-    live = True
-
-    def __init__(self, wrench: PartSource, motion: PartSource | None = None) -> None:
+    def __init__(self, wrench: Source, motion: Source | None = None) -> None:
         self._wrench, self._motion = wrench, motion
         self.dt, self.two_clocks = wrench.dt, motion is not None
         streams = (wrench if motion is None else motion).streams
@@ -166,19 +163,20 @@ class PartStreams:
                 where="the source",
                 remedy="give --motion, such as rtde://HOST",
             )
+        self.streams = WRENCH, self.motion_stream
 
-    def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
-        """Return the received parts with their times of arrival [s]; None at the end."""
-        found: list[tuple[Part, float]] = []
-        if self._motion is not None:
-            motions, now = self._motion.read(0.0) or (), time.monotonic()
-            found += [(part, now) for part in motions if part.stream != WRENCH]
-        parts = self._wrench.read(timeout_s)
-        if parts is None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """Return the received readings with their times of arrival; None at the end."""
+        motions = self._motion.read(0.0) or [] if self._motion is not None else []
+        moved = time.monotonic()
+        readings = self._wrench.read(timeout_s)
+        if readings is None:
             return None
-        now = time.monotonic()
-        alone = self._motion is None
-        return found + [(part, now) for part in parts if alone or part.stream == WRENCH]
+        now, alone = time.monotonic(), self._motion is None
+        found = [each._replace(arrival=moved) for each in motions if each.stream != WRENCH]
+        return found + [
+            each._replace(arrival=now) for each in readings if alone or each.stream == WRENCH
+        ]
 
     def close(self) -> None:
         self._wrench.close()
@@ -197,27 +195,26 @@ class ArmKinematics(Protocol):
         """Return the sensor's pose X_WS (7,) at joint positions q (n,): [w x y z, position]."""
 
 
-class PoseSourceFromJoints:
+class PoseSourceFromJoints(Source):
     """Source that converts joint positions to poses of the sensor frame S."""
 
-    def __init__(self, source: PartSource, arm: ArmKinematics) -> None:
+    def __init__(self, source: Source, arm: ArmKinematics) -> None:
         self._source, self._arm, self.dt = source, arm, source.dt
-        others = (stream for stream in source.streams if stream not in (JOINTS, POSE))
-        self.streams: tuple[str, ...] = (*others, POSE)
+        self.streams = (*(each for each in source.streams if each not in (JOINTS, POSE)), POSE)
 
-    def read(self, timeout_s: float) -> list[Part] | None:
-        parts = self._source.read(timeout_s)
-        if parts is None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        readings = self._source.read(timeout_s)
+        if readings is None:
             return None
-        return [self._convert_to_pose(part) for part in parts if part.stream != POSE]
+        return [self._convert_to_pose(each) for each in readings if each.stream != POSE]
 
-    def _convert_to_pose(self, part: Part) -> Part:
-        if part.stream != JOINTS:
-            return part
+    def _convert_to_pose(self, reading: Reading) -> Reading:
+        if reading.stream != JOINTS:
+            return reading
         values = np.full(7, np.nan)  # an invalid pose, rejected later
-        if part.values.shape == (len(self._arm.joint_names),):
-            values = self._arm.pose(part.values)
-        return part._replace(stream=POSE, values=values)
+        if reading.values.shape == (len(self._arm.joint_names),):
+            values = self._arm.pose(reading.values)
+        return reading._replace(stream=POSE, values=values)
 
     def close(self) -> None:
         self._source.close()
@@ -252,39 +249,39 @@ class MotionWindow:
             self._size = self._weights.shape[1]
             self.reset()
 
-    def motions_completed_by(self, part: Part, now: float) -> list[tuple[float, Array]]:
+    def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
         """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
-        row = self._row_of_valid_part(part)
+        row = self._row_of_valid_motion(sample)
         if row is None:
             return []
         last = self._last
-        step = math.inf if last is None else part.t - last[0]
-        if step <= 0.0 and now - self._arrival <= STALE_AGE_S:
+        step = math.inf if last is None else sample.t - last[0]
+        if step <= 0.0 and sample.arrival - self._arrival <= STALE_AGE_S:
             return []  # out of order or repeated
         if not self._dt and _MIN_MOTION_PERIOD_S <= step <= STALE_AGE_S:
             self._measure_period(step)
         if self._last is None or not 0.0 < step <= STALE_AGE_S:
             self.reset()
-            self._next_t, last = part.t, (part.t, row)
-        self._last, self._arrival = (part.t, row), now
+            self._next_t, last = sample.t, (sample.t, row)
+        self._last, self._arrival = (sample.t, row), sample.arrival
         found: list[tuple[float, Array]] = []
         if not self._dt or last is None:
             return found
-        while self._next_t <= part.t:
-            share = (self._next_t - last[0]) / max(part.t - last[0], 1e-9)
+        while self._next_t <= sample.t:
+            share = (self._next_t - last[0]) / max(sample.t - last[0], 1e-9)
             self._rows.append(last[1] + share * (row - last[1]))
             if len(self._rows) == self._size:
                 found.append((self._next_t - self._size // 2 * self._dt, self._smoothed_motion()))
             self._next_t += self._dt
         return found
 
-    def _row_of_valid_part(self, part: Part) -> Array | None:
-        values = part.values
-        if part.flags or not (
-            abs(part.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
+    def _row_of_valid_motion(self, sample: Reading) -> Array | None:
+        values = sample.values
+        if sample.flags or not (
+            abs(sample.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
         ):
             return None
-        if part.stream == IMU:
+        if sample.stream == IMU:
             return values
         size = float(np.linalg.norm(values[:4]))
         if not abs(size - 1.0) < 0.01:
@@ -322,7 +319,7 @@ class _StreamClockOffset:
             self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 
-class ReadingAssembler:
+class ReadingAssembler(Source):
     """Source of readings: wrenches with the motion of another stream at the same time.
 
     Args:
@@ -332,11 +329,9 @@ class ReadingAssembler:
         weight_removed: True if the robot has removed the load's weight from the wrench.
     """
 
-    live = True
-
     def __init__(
         self,
-        parts: PartStreams,
+        streams: ReadingStreams,
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
@@ -344,9 +339,9 @@ class ReadingAssembler:
         X_FS: Array = IDENTITY_POSE,
         weight_removed: bool = False,
     ) -> None:
-        if weight_removed and parts.motion_stream == IMU:
+        if weight_removed and streams.motion_stream == IMU:
             raise missing_orientation_error("the source")
-        self._parts, self._delay, self.dt = parts, delay_s, parts.dt
+        self._streams, self._delay, self.dt = streams, delay_s, streams.dt
         self._tracker = None
         if track is not None:
             self._tracker = DelayTracker(track, self.dt, cutoff_hz, delay_s)
@@ -356,7 +351,7 @@ class ReadingAssembler:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / cutoff_hz + delay_s)
         self._clocks = _StreamClockOffset(), _StreamClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
-        self._pending: deque[Part] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
+        self._pending: deque[Reading] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
 
     @property
     def delay_s(self) -> float:
@@ -364,24 +359,22 @@ class ReadingAssembler:
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """Return the readings completed within `timeout_s` [s]; None after the last wrench."""
-        arrived = self._parts.read(timeout_s)
+        arrived = self._streams.read(timeout_s)
         if arrived is None:
             return None
-        return [
-            reading for part, now in arrived for reading in self.readings_completed_by(part, now)
-        ]
+        return [each for sample in arrived for each in self.readings_completed_by(sample)]
 
-    def readings_completed_by(self, part: Part, now: float) -> list[Reading]:
-        """Add a part received at `now` [s]; return the readings that became complete."""
-        if part.stream == WRENCH:
-            self._clocks[0].update(part.t, now)
-            self._pending.append(part)
-        elif part.stream == self._parts.motion_stream:
-            self._clocks[1].update(part.t, now)
+    def readings_completed_by(self, sample: Reading) -> list[Reading]:
+        """Add a wrench or motion; return the readings that became complete."""
+        if sample.stream == WRENCH:
+            self._clocks[0].update(sample.t, sample.arrival)
+            self._pending.append(sample)
+        elif sample.stream == self._streams.motion_stream:
+            self._clocks[1].update(sample.t, sample.arrival)
             shift = -self.delay_s
-            if self._parts.two_clocks:
+            if self._streams.two_clocks:
                 shift += self._clocks[1].offset - self._clocks[0].offset
-            for t, motion in self._window.motions_completed_by(part, now):
+            for t, motion in self._window.motions_completed_by(sample):
                 self._store_motion(t + shift, motion)
         found = []
         while self._pending and (reading := self._complete_reading(self._pending[0])) is not None:
@@ -400,23 +393,24 @@ class ReadingAssembler:
             while t - motions[0][0] > _STREAM_BUFFER_S:
                 motions.popleft()
 
-    def _complete_reading(self, part: Part) -> Reading | None:
-        values, flags, motions = np.zeros(NUM_READING_VALUES), part.flags, self._motions
-        values[:6] = part.values
-        if not math.isfinite(part.t):
-            return Reading(part.number, part.t, values, flags)
-        if not motions or part.t > motions[-1][0]:
+    def _complete_reading(self, sample: Reading) -> Reading | None:
+        values, flags, motions = np.zeros(NUM_READING_VALUES), sample.flags, self._motions
+        values[:6] = sample.values
+        if not math.isfinite(sample.t):
+            return Reading(sample.number, sample.t, values, flags)
+        if not motions or sample.t > motions[-1][0]:
             return None
-        at = bisect_right(motions, part.t, key=lambda each: each[0])
+        at = bisect_right(motions, sample.t, key=lambda each: each[0])
         after, before = motions[min(at, len(motions) - 1)], motions[max(0, at - 1)]
-        if part.t < before[0] or after[0] - before[0] > STALE_AGE_S:
-            return Reading(part.number, part.t, values, flags | ReadingFlag.STALE)
-        share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
+        if sample.t < before[0] or after[0] - before[0] > STALE_AGE_S:
+            return Reading(sample.number, sample.t, values, flags | ReadingFlag.STALE)
+        share = (sample.t - before[0]) / max(after[0] - before[0], 1e-9)
         motion = before[1] + share * (after[1] - before[1])
         values[6:] = motion[:9]
-        if self._tracker is not None and not flags and np.isfinite(part.values).all():
-            self._tracker.update_delay((part.t, values[6:]), part.values, before, after)
-        return Reading(part.number, part.t, values, flags, motion[9:] if len(motion) > 9 else None)
+        if self._tracker is not None and not flags and np.isfinite(sample.values).all():
+            self._tracker.update_delay((sample.t, values[6:]), sample.values, before, after)
+        gravity = motion[9:] if len(motion) > 9 else None
+        return Reading(sample.number, sample.t, values, flags, gravity)
 
     def close(self) -> None:
-        self._parts.close()
+        self._streams.close()

@@ -7,7 +7,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.recording import SampleRecorder
+from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Source
 
 TOLERANCE_CONFIDENCE = 0.9998
@@ -197,12 +196,11 @@ def _candidate_information_matrices(
 DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _STREAM_READ_TIMEOUT_S = 0.05
-_SampleT = TypeVar("_SampleT")
 
 
 def calibrate(
-    source: Source[_SampleT],
-    recorder: SampleRecorder[_SampleT],
+    source: Source,
+    recorder: Recorder,
     path: Path,
     tolerance: Tolerance,
     *,
@@ -236,10 +234,10 @@ def calibrate(
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
             while not (done or INTERRUPTED_EVENT.is_set()):
-                if (samples := source.read(_STREAM_READ_TIMEOUT_S)) is None:
+                if (readings := source.read(_STREAM_READ_TIMEOUT_S)) is None:
                     break
-                for sample in samples:
-                    recorder.add(sample)
+                for reading in readings:
+                    recorder.add(reading)
                     if pending is None and recorder.longest_part_s >= next_length_s:
                         next_length_s = max(
                             FIRST_RECORD_S, RECORD_GROWTH_FACTOR * recorder.longest_part_s

@@ -31,16 +31,12 @@ TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_TEST_TRIGGER_FLAGS, _INVALID_FLAGS = (
-    int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD),
-    ~int(NONZERO_WRENCH_FLAGS),
-)
+_TEST_TRIGGER_FLAGS = int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD)
+_INVALID_FLAGS = ~int(NONZERO_WRENCH_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
-_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE = (
-    0.5  # m/s^2, minimum standard deviation of the specific force after a change
-)
+_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE = 0.5  # m/s^2, standard deviation
 _CHANGE_TEST_NICENESS, _CHANGE_TEST_TIMEOUT_S = 10, 60.0
 
 TimedChangeText = tuple[float, str]

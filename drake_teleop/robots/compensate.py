@@ -20,7 +20,7 @@ from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.streams import CompensatedWrench, Reading, Sink, Source
+from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
 from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
@@ -50,7 +50,7 @@ class TareRequestPort:
 
 
 def compensate_stream(
-    source: Source[Reading],
+    source: Source,
     compensator: Compensator,
     sink: Sink,
     *,

@@ -58,16 +58,12 @@ _MAX_TIME_STAMP_S = 1e12  # [s]
 _ZERO_GRAVITY = np.zeros(3)
 _MAX_READING_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `ReadingFlag` takes a microsecond.
-_DAMAGED_FLAG, _STALE_FLAG, _CLIPPED_FLAG = (
-    int(ReadingFlag.DAMAGED),
-    int(ReadingFlag.STALE),
-    int(ReadingFlag.CLIPPED),
-)
-_NONZERO_WRENCH_FLAGS, _GAP_FLAG, _WRONG_RATE_FLAG = (
-    int(NONZERO_WRENCH_FLAGS),
-    int(ReadingFlag.GAP),
-    int(ReadingFlag.WRONG_RATE),
-)
+_DAMAGED_FLAG = int(ReadingFlag.DAMAGED)
+_STALE_FLAG = int(ReadingFlag.STALE)
+_CLIPPED_FLAG = int(ReadingFlag.CLIPPED)
+_NONZERO_WRENCH_FLAGS = int(NONZERO_WRENCH_FLAGS)
+_GAP_FLAG = int(ReadingFlag.GAP)
+_WRONG_RATE_FLAG = int(ReadingFlag.WRONG_RATE)
 _IN_CONTACT_FLAG = int(ReadingFlag.IN_CONTACT)
 _FLAG_OF_PROBLEM = {
     VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,

@@ -16,15 +16,15 @@ from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
     ArmKinematics,
-    PartStreams,
     PoseSourceFromJoints,
     ReadingAssembler,
+    ReadingStreams,
     pose_from_rpy,
 )
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
-from drake_teleop.robots.recording import PartRecorder, ReadingRecorder, SampleRecorder
+from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
+from drake_teleop.robots.streams import JOINTS, WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY_PREFIX = "replay:"
@@ -42,48 +42,40 @@ def open_source(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: ArmKinematics | None = None,
-) -> Source[Reading]:
-    """Return the source at an address.
+) -> Source:
+    """Return the source of wrench and motion at an address.
 
     Args:
         load: identified load, for the delay and for `weight_removed`.
         rate_hz: rate of the wrenches, if the source does not deliver its own.
-        cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live parts.
+        cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live streams.
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
         arm: kinematics, for a source of joint positions.
     """
-    kind = _address_scheme(address)
-    if kind in PART_SOURCES:
-        track = load if isinstance(delay, str) else None
-        if isinstance(delay, str):
-            delay = 0.0 if load is None else load.delay_s
-        parts = _open_parts(address, rate_hz, motion, arm)
-        return ReadingAssembler(
-            parts,
-            cutoff_hz=cutoff_hz,
-            delay_s=delay,
-            track=track,
-            X_FS=_pose_from_option(sensor_pose),
-            weight_removed=load is not None and load.weight_removed,
-        )
-    if motion is not None or sensor_pose is not None or arm is not None:
-        raise DrakeTeleopError(
-            "this source already contains the motion of sensor frame S",
-            where=address,
-            remedy="remove --motion, --model and --sensor-pose",
-        )
-    if kind == "replay":
+    if _address_scheme(address) == "replay":
+        _refuse_motion_options(address, motion, sensor_pose, arm)
         path = address.removeprefix(_REPLAY_PREFIX)
-        options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
-        return ReplayLogSource(path, load, **options)  # type: ignore[arg-type]
-    if kind not in SOURCES:
-        remedy = f"give {_address_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
-        raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
-    if load is not None and load.weight_removed:
-        raise missing_orientation_error(address)
-    return SOURCES[kind](address, _require_period_s(rate_hz, address))
+        return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
+    source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
+    weight_removed = load is not None and load.weight_removed
+    if not isinstance(source, ReadingStreams):
+        if weight_removed:
+            source.close()
+            raise missing_orientation_error(address)
+        return source
+    track = load if isinstance(delay, str) else None
+    if isinstance(delay, str):
+        delay = 0.0 if load is None else load.delay_s
+    return ReadingAssembler(
+        source,
+        cutoff_hz=cutoff_hz,
+        delay_s=delay,
+        track=track,
+        X_FS=_pose_from_option(sensor_pose),
+        weight_removed=weight_removed,
+    )
 
 
 def open_source_and_recorder(
@@ -94,16 +86,18 @@ def open_source_and_recorder(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: ArmKinematics | None = None,
-) -> tuple[Source[Any], SampleRecorder[Any]]:
-    """Return the stream that `calibrate` reads, and its recorder."""
+) -> tuple[Source, Recorder]:
+    """Return the source that `calibrate` reads, and its recorder."""
     kind = _address_scheme(address)
+    if kind == "replay":
+        options: dict[str, Any] = {"motion": motion, "sensor_pose": sensor_pose, "arm": arm}
+        return open_source(address, None, real_time=real_time, **options), Recorder(largest=largest)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
-    if kind in PART_SOURCES:
-        parts = _open_parts(address, rate_hz, motion, arm)
-        return parts, PartRecorder(parts, largest, _pose_from_option(sensor_pose))
-    readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
-    return open_source(address, None, rate_hz=rate_hz, **readings), ReadingRecorder(largest)  # type: ignore[arg-type]
+    source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
+    two_clocks = isinstance(source, ReadingStreams) and source.two_clocks
+    X_FS = _pose_from_option(sensor_pose)
+    return source, Recorder(source.streams, largest, X_FS, two_clocks=two_clocks)
 
 
 def is_file_address(address: str) -> bool:
@@ -118,9 +112,8 @@ def open_sink(address: str) -> Sink:
     return SINKS[kind](address)
 
 
-def _address_forms(*tables: Registry[Any]) -> str:
-    names = (name for table in tables for name in table)
-    return ", ".join(f"{name}://" if name[0].isalnum() else name for name in names)
+def _address_forms(table: Registry[Any]) -> str:
+    return ", ".join(f"{name}://" if name[0].isalnum() else name for name in table)
 
 
 def _address_scheme(address: str) -> str:
@@ -137,40 +130,57 @@ def _require_period_s(rate_hz: float | None, address: str) -> float:
     return 1.0 / rate_hz
 
 
-def _open_part_source(
-    address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
-) -> PartSource:
-    kind = _address_scheme(address)
-    if kind not in PART_SOURCES:
-        remedy = f"give {_address_forms(PART_SOURCES)}"
-        raise DrakeTeleopError("delivers no motion", where=address, remedy=remedy)
-    return PART_SOURCES[kind](address, rate_hz, joints)
+def _refuse_motion_options(address: str, *options: Any) -> None:
+    if any(option is not None for option in options):
+        raise DrakeTeleopError(
+            "this source already contains the motion of sensor frame S",
+            where=address,
+            remedy="remove --motion, --model and --sensor-pose",
+        )
 
 
-def _open_parts(
-    address: str, rate_hz: float | None, motion: str | None, arm: ArmKinematics | None
-) -> PartStreams:
-    names = () if arm is None else arm.joint_names
-    wrench = _open_part_source(address, rate_hz, names)
-    other: PartSource | None = None
+def _open_streams(
+    address: str,
+    rate_hz: float | None,
+    motion: str | None,
+    sensor_pose: tuple[float, ...] | None,
+    arm: ArmKinematics | None,
+) -> Source:
+    joints = () if arm is None else arm.joint_names
+    opened = [_open_registered_source(address, rate_hz, joints)]
     try:
-        other = None if motion is None else _open_part_source(motion, 1.0 / wrench.dt, names)
-        if arm is None:
-            return PartStreams(wrench, other)
-        motion_source = wrench if other is None else other
-        if JOINTS not in motion_source.streams:
-            raise DrakeTeleopError(
-                "delivers no joint positions for --model",
-                where=address if motion is None else motion,
-                remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
-            )
-        posed = PoseSourceFromJoints(motion_source, arm)
-        return PartStreams(posed) if other is None else PartStreams(wrench, posed)
+        if WRENCH_AND_MOTION in opened[0].streams:
+            _refuse_motion_options(address, motion, sensor_pose, arm)
+            return opened[0]
+        if motion is not None:
+            opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))
+            if WRENCH_AND_MOTION in opened[1].streams:
+                raise DrakeTeleopError(
+                    "delivers no motion apart from its wrench",
+                    where=motion,
+                    remedy="give a source such as rtde://HOST",
+                )
+        if arm is not None:
+            if JOINTS not in opened[-1].streams:
+                raise DrakeTeleopError(
+                    "delivers no joint positions for --model",
+                    where=address if motion is None else motion,
+                    remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
+                )
+            opened[-1] = PoseSourceFromJoints(opened[-1], arm)
+        return ReadingStreams(*opened)
     except BaseException:
-        for each in (wrench, other):
-            if each is not None:
-                each.close()
+        for each in opened:
+            each.close()
         raise
+
+
+def _open_registered_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> Source:
+    kind = _address_scheme(address)
+    if kind not in SOURCES:
+        remedy = f"give {_address_forms(SOURCES)}, or replay:LOG"
+        raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
+    return SOURCES[kind](address, rate_hz, joints)
 
 
 def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
@@ -182,13 +192,13 @@ def _make_source_or_sink(module: str, class_name: str, *arguments: Any) -> Any:
     return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
 
-SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
-    "source", {"udp": UdpSource, "-": lambda address, dt: JsonLineSource(sys.stdin.fileno(), dt)}
-)
-"""Sources of readings by the scheme of their address, called with address and period [s]."""
-PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource]] = Registry(
-    "source of parts",
+SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], Source]] = Registry(
+    "source",
     {
+        "udp": lambda address, hz, joints: UdpSource(address, _require_period_s(hz, address)),
+        "-": lambda address, hz, joints: JsonLineSource(
+            sys.stdin.fileno(), _require_period_s(hz, address)
+        ),
         "posed": lambda address, hz, joints: PosedSource(address, _require_period_s(hz, address)),
         "rtde": lambda address, hz, joints: _make_source_or_sink("rtde", "RtdeSource", address),
         "netft": lambda address, hz, joints: _make_source_or_sink(
@@ -202,7 +212,7 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
         ),
     },
 )
-"""Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
+"""Sources by the scheme of their address, called with address, rate [Hz] or None, joint names."""
 SINKS: Registry[Callable[[str], Sink]] = Registry(
     "sink",
     {

@@ -70,10 +70,8 @@ def flag_names(flags: int) -> list[str]:
     return [str(flag.name).lower().replace("_", " ") for flag in ReadingFlag if flag & flags]
 
 
-class JsonLineSource(Source[Reading]):
+class JsonLineSource(Source):
     """Source of readings, as lines of JSON, from a growing file such as standard input."""
-
-    live = True
 
     def __init__(self, file: int, dt: float) -> None:
         self.dt, self._file, self._partial, self._number, self._ended = dt, file, b"", 0, False

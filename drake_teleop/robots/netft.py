@@ -16,7 +16,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, WRENCH, Part, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Reading, ReadingFlag, Source
 
 DEFAULT_UDP_PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
@@ -31,10 +31,10 @@ _SETTINGS_PAGE_TIMEOUT_S, _MAX_SETTINGS_PAGE_BYTES = 2.0, 1 << 20
 _SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
-class NetFtSource:
+class NetFtSource(Source):
     """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m."""
 
-    streams: tuple[str, ...] = (WRENCH,)
+    streams = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
         parsed = Address(address, DEFAULT_UDP_PORT, allowed=("counts", "rate", "sign"))
@@ -58,23 +58,23 @@ class NetFtSource:
         self._last_received = self._last_request = -math.inf
         self._measured, self._measured_at = -1, -math.inf
 
-    def read(self, timeout_s: float) -> list[Part] | None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
         self._request_stream()
-        found: list[Part] = []
+        found: list[Reading] = []
         self._socket.settimeout(timeout_s)
         try:
             while len(found) < _MAX_RECORDS_PER_CALL:
                 packet = self._socket.recv(RECORD_FORMAT.size + 1)
-                found.append(self.part_of_packet(packet, time.monotonic()))
+                found.append(self.reading_of_packet(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
         except OSError:  # no further record, or no box
             pass
         return found
 
-    def part_of_packet(self, packet: bytes, now: float) -> Part:
+    def reading_of_packet(self, packet: bytes, now: float) -> Reading:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         if len(packet) != RECORD_FORMAT.size:
-            return DAMAGED_WRENCH_PART
+            return DAMAGED_WRENCH
         rdt_sequence, ft_sequence, status, *counts = RECORD_FORMAT.unpack(packet)
         # rdt_sequence has 32 bits and wraps around.
         self._number += (rdt_sequence - self._number + 2**31) % 2**32 - 2**31
@@ -89,7 +89,7 @@ class NetFtSource:
         elif now - self._measured_at > _MAX_UNCHANGED_WRENCH_S:
             flags |= int(ReadingFlag.STALE)
         t = self._pace.time_of_sample(self._number, now)
-        return Part(WRENCH, self._number, t, np.array(counts) * self._per_count, flags)
+        return Reading(self._number, t, np.array(counts) * self._per_count, flags, stream=WRENCH)
 
     def _request_stream(self) -> None:
         now = time.monotonic()

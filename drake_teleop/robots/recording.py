@@ -1,11 +1,10 @@
-"""Recorders that write the samples of a stream as a log."""
+"""Recorder that writes the readings of a source as a log."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +15,14 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.assembly import PartStreams
+from drake_teleop.robots.assembly import IDENTITY_POSE
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
 from drake_teleop.robots.streams import (
     IMU,
     NUM_READING_VALUES,
     POSE,
     WRENCH,
-    Part,
+    WRENCH_AND_MOTION,
     Reading,
     ReadingFlag,
 )
@@ -46,37 +45,61 @@ _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
 _QUATERNION_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
 _NEW_CLOCK_CONFIRMATION_SAMPLES = 50  # successive samples that confirm another clock
-_SampleT = TypeVar("_SampleT")
 
 
-class SampleRecorder(ABC, Generic[_SampleT]):
-    """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
+class Recorder:
+    """Recorder of a source's readings, which are written as a log.
 
     If the source's clock is set, a new record starts; the longest one is written.
 
+    Args:
+        streams: streams of the source.
+        largest: (6,) range of the sensor [N, N m]; None: unknown.
+        X_FS: (7,) pose of the sensor in the posed frame F.
+        two_clocks: whether wrench and motion have different clocks.
+
     Attributes:
-        left_out: number of rejected samples.
+        log_file_name, file_names: name of the log, and of all its files.
+        left_out: number of rejected readings.
         clock_changes: number of clock changes.
     """
 
-    log_file_name: str
-    file_names: tuple[str, ...]
-
-    def __init__(self, largest: dict[str, Array | None]) -> None:
-        self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
+    def __init__(
+        self,
+        streams: tuple[str, ...] = (WRENCH_AND_MOTION,),
+        largest: Array | None = None,
+        X_FS: Array = IDENTITY_POSE,
+        *,
+        two_clocks: bool = False,
+    ) -> None:
+        self._streams, self._two_clocks = streams, two_clocks
+        self._largest = np.full(6, np.inf) if largest is None else largest
+        self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
+        self._p_FS = X_FS[4:]
+        self.log_file_name = "log.parquet"
+        self.file_names: tuple[str, ...] = ("log.parquet",)
+        if WRENCH_AND_MOTION not in streams:
+            self.log_file_name = "log.yaml"
+            self.file_names = "log.yaml", *(f"{each}.parquet" for each in _LOG_COLUMNS_OF_STREAM)
         self.left_out, self.clock_changes = 0, 0
         self._part, self._other_clock = self._make_empty_part(), self._make_empty_part()
         self._longest = self._part
 
     def _make_empty_part(self) -> dict[str, _SampleSeries]:
-        return {stream: _SampleSeries() for stream in self._largest}
+        return {stream: _SampleSeries() for stream in self._streams}
 
-    def _add_sample(
-        self, stream: str, t: float, values: Array, flags: int, now: float = 0.0
-    ) -> None:
+    def add(self, reading: Reading) -> None:
+        """Add a reading if it is valid."""
+        stream, t, values = reading.stream, reading.t, reading.values
+        if stream not in self._part:
+            return
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        saturated = (np.abs(values[:6]) >= self._largest[stream]).any()
-        if not finite or flags & _INVALID_FLAGS or saturated:
+        valid = finite and not reading.flags & _INVALID_FLAGS
+        if stream == POSE:
+            valid &= abs(float(np.linalg.norm(values[:4])) - 1.0) < _QUATERNION_NORM_TOLERANCE
+        elif stream in (WRENCH, WRENCH_AND_MOTION):
+            valid &= not (np.abs(values[:6]) >= self._largest).any()
+        if not valid:
             self.left_out += 1
             return
         samples, other = self._part[stream], self._other_clock[stream]
@@ -84,7 +107,7 @@ class SampleRecorder(ABC, Generic[_SampleT]):
         if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _SampleSeries()
-        self.left_out += not (samples if same_clock else other).add(t, values, now)
+        self.left_out += not (samples if same_clock else other).add(reading)
         if len(other.t) == _NEW_CLOCK_CONFIRMATION_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
@@ -97,89 +120,35 @@ class SampleRecorder(ABC, Generic[_SampleT]):
     def longest_part_s(self) -> float:
         return _min_stream_duration_s(self._longest_part())
 
-    @abstractmethod
-    def add(self, sample: _SampleT) -> None:
-        """Add a sample if it is valid."""
-
-    @abstractmethod
-    def write(self, path: Path) -> None: ...
-
-
-class ReadingRecorder(SampleRecorder[Reading]):
-    """Recorder of readings; `largest` (6,) is the range of the sensor [N, N m]."""
-
-    log_file_name = "log.parquet"
-    file_names: tuple[str, ...] = (log_file_name,)
-
-    def __init__(self, largest: Array | None = None) -> None:
-        super().__init__({WRENCH: largest})
-
-    def add(self, sample: Reading) -> None:
-        self._add_sample(WRENCH, sample.t, sample.values, sample.flags)
-
-    def write(self, path: Path) -> None:
-        t, values = self._longest_part()[WRENCH].times_and_values(NUM_READING_VALUES, self.left_out)
-        wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
-        write_log(Log(t - t[0], wrench, s, omega, alpha), path)
-
-
-class PartRecorder(SampleRecorder[tuple[Part, float]]):
-    """Recorder of parts: wrenches, and poses or IMU samples.
-
-    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame F.
-    """
-
-    log_file_name = "log.yaml"
-    file_names: tuple[str, ...] = (
-        log_file_name,
-        *(f"{stream}.parquet" for stream in _LOG_COLUMNS_OF_STREAM),
-    )
-
-    def __init__(self, parts: PartStreams, largest: Array | None, X_FS: Array) -> None:
-        super().__init__({WRENCH: largest, parts.motion_stream: None})
-        self._motion_stream, self._two_clocks = parts.motion_stream, parts.two_clocks
-        self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
-        self._p_FS = X_FS[4:]
-
-    def add(self, sample: tuple[Part, float]) -> None:
-        part, now = sample
-        if part.stream not in self._part:
-            return
-        size = float(np.linalg.norm(part.values[:4])) if part.stream == POSE else 1.0
-        flags = (
-            part.flags
-            if abs(size - 1.0) < _QUATERNION_NORM_TOLERANCE
-            else part.flags | ReadingFlag.DAMAGED
-        )
-        self._add_sample(part.stream, part.t, part.values, flags, now)
-
     def write(self, path: Path) -> None:
         import polars as pl
 
-        wrench, motion = (self._longest_part()[stream] for stream in (WRENCH, self._motion_stream))
-        start = wrench.times_and_values(6, self.left_out)[0][0]
-        behind = motion.min_offset - wrench.min_offset if self._two_clocks else 0.0
-        for stream, samples, shift in (
-            (WRENCH, wrench, -start),
-            (self._motion_stream, motion, behind - start),
-        ):
+        part = self._longest_part()
+        if WRENCH_AND_MOTION in part:
+            t, values = part[WRENCH_AND_MOTION].times_and_values(NUM_READING_VALUES, self.left_out)
+            wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
+            write_log(Log(t - t[0], wrench, s, omega, alpha), path)
+            return
+        start = part[WRENCH].times_and_values(6, self.left_out)[0][0]
+        for stream, samples in part.items():
+            shift = samples.min_offset - part[WRENCH].min_offset if self._two_clocks else 0.0
             names = [
                 name for columns in _LOG_COLUMNS_OF_STREAM[stream].values() for name in columns
             ]
             t, values = samples.times_and_values(len(names), self.left_out)
-            columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
+            columns = {"t": t + (shift - start)} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
         write_text(path, to_yaml_text(self._log_description()))
 
     def _log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY_M_S2}
-        for stream in (WRENCH, self._motion_stream):
+        for stream in self._streams:
             fields = {
                 name: {"columns": list(names)}
                 for name, names in _LOG_COLUMNS_OF_STREAM[stream].items()
             }
             found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
-        if self._motion_stream == POSE:
+        if POSE in found:
             R_SF = self._R_FS.T
             found[POSE]["orientation"]["form"] = "quaternion_wxyz"
             found[POSE]["position_in_sensor"] = (-R_SF @ self._p_FS).tolist()
@@ -196,12 +165,12 @@ class _SampleSeries:
     def is_clock_jump(self, t: float) -> bool:
         return bool(self.t) and abs(t - self.t[-1]) > CLOCK_JUMP_S
 
-    def add(self, t: float, values: Array, now: float) -> bool:
-        if self.t and t <= self.t[-1]:
+    def add(self, reading: Reading) -> bool:
+        if self.t and reading.t <= self.t[-1]:
             return False
-        self.t.append(t)
-        self._values.append(values)
-        self.min_offset = min(self.min_offset, now - t)
+        self.t.append(reading.t)
+        self._values.append(reading.values)
+        self.min_offset = min(self.min_offset, reading.arrival - reading.t)
         return True
 
     def times_and_values(self, width: int, left_out: int) -> tuple[Array, Array]:

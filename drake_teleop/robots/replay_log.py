@@ -17,7 +17,7 @@ from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
 
-class ReplayLogSource(Source[Reading]):
+class ReplayLogSource(Source):
     """Source of a log's readings, with the motion aligned to the wrench.
 
     `wait` is the removed delay of the motion, in readings; `chunk` the largest number of readings

@@ -19,12 +19,18 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged_part_of_topic,
+    damaged_reading_of_topic,
     domain_of_address,
     topic_of_address,
     topics_frames_and_streams,
 )
-from drake_teleop.robots.streams import NONZERO_WRENCH_FLAGS, CompensatedWrench, Part, ReadingFlag
+from drake_teleop.robots.streams import (
+    NONZERO_WRENCH_FLAGS,
+    CompensatedWrench,
+    Reading,
+    ReadingFlag,
+    Source,
+)
 
 _NODE_NAME = "drake_teleop"
 _MAX_DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
@@ -86,7 +92,7 @@ def message_class(kind: str, where: str) -> Any:
         ) from None
 
 
-class Ros2Source:
+class Ros2Source(Source):
     """Source at ros2://TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&domain=N&sign=1].
 
     TOPIC is a WrenchStamped. `/tf` and `/tf_static` contain all frames between PARENT and CHILD.
@@ -99,7 +105,7 @@ class Ros2Source:
         topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
-        self._found: list[Part] = []
+        self._found: list[Reading] = []
         self._counts: Counter[str] = Counter()
         self._node, self._next_spin = shared_node(domain), 0.0
         self._subscriptions = [
@@ -107,7 +113,7 @@ class Ros2Source:
         ]
 
     @delayed_signals()
-    def read(self, timeout_s: float) -> list[Part] | None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
         self._take_messages()
         if not self._found:
             self._node.spin(timeout_s)
@@ -140,9 +146,9 @@ class Ros2Source:
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(damaged_part_of_topic(name))
+                self._found.append(damaged_reading_of_topic(name))
                 return
-            self._found += self._converter.parts_of_message(name, data, number)
+            self._found += self._converter.readings_of_message(name, data, number)
 
         return receive
 

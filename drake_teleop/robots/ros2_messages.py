@@ -1,4 +1,4 @@
-"""Conversion of ROS 2 messages to parts, for the sources by rclpy and by zenoh."""
+"""Conversion of ROS 2 messages to readings, for the sources by rclpy and by zenoh."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_product, rotate_vector
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH_PART, IMU, JOINTS, POSE, WRENCH, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Reading
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 MESSAGE_TYPE_OF_TOPIC = {
@@ -74,12 +74,12 @@ def topics_frames_and_streams(
     return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
 
 
-def damaged_part_of_topic(name: str) -> Part:
-    return DAMAGED_WRENCH_PART._replace(stream=_STREAM_OF_TOPIC.get(name, name))
+def damaged_reading_of_topic(name: str) -> Reading:
+    return DAMAGED_WRENCH._replace(stream=_STREAM_OF_TOPIC.get(name, name))
 
 
 class MessageConverter:
-    """Converter of ROS 2 messages to parts; `frames` are parent and child of the pose in `/tf`."""
+    """Converter of ROS 2 messages; `frames` are parent and child of the pose in `/tf`."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
@@ -87,15 +87,16 @@ class MessageConverter:
         self._sign, self._frames, self._joints = sign, frames, joints
         self._links: dict[str, tuple[str, Array]] = {}
 
-    def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
-        """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
+    def readings_of_message(self, name: str, data: Any, number: int) -> list[Reading]:
+        """Return the readings of a ROS message; `name` is a key of `MESSAGE_TYPE_OF_TOPIC`."""
         if name == "tf":
             samples = self._pose_from_transforms(data)
         else:
             values = self._message_values(name, data)
             samples = [] if values is None else [(data.header.stamp, values)]
+        stream = _STREAM_OF_TOPIC.get(name, name)
         return [
-            Part(_STREAM_OF_TOPIC.get(name, name), number, stamp.sec + 1e-9 * stamp.nanosec, values)
+            Reading(number, stamp.sec + 1e-9 * stamp.nanosec, values, stream=stream)
             for stamp, values in samples
         ]
 

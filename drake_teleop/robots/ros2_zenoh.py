@@ -19,12 +19,12 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged_part_of_topic,
+    damaged_reading_of_topic,
     domain_of_address,
     topic_of_address,
     topics_frames_and_streams,
 )
-from drake_teleop.robots.streams import CompensatedWrench, Part
+from drake_teleop.robots.streams import CompensatedWrench, Reading, Source
 
 DEFAULT_ROUTER_PORT = 7447
 _NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
@@ -113,10 +113,10 @@ class CdrConverter(MessageConverter):
         self._types, self._damaged = message_types(), SerdeError
         self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
         for name in MESSAGE_TYPE_OF_TOPIC:  # creates the deserializers before the first message
-            self.parts_of_cdr(name, b"", b"")
+            self.readings_of_cdr(name, b"", b"")
         self._counts = dict.fromkeys(MESSAGE_TYPE_OF_TOPIC, 0)
 
-    def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
+    def readings_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Reading]:
         self._counts[name] += 1
         number = number_in_attachment(attachment)
         if number is None:
@@ -124,11 +124,11 @@ class CdrConverter(MessageConverter):
         try:
             data = self._types.deserialize_cdr(message, MESSAGE_TYPE_OF_TOPIC[name])
         except self._damaged:
-            return [damaged_part_of_topic(name)]
-        return self.parts_of_message(name, data, number)
+            return [damaged_reading_of_topic(name)]
+        return self.readings_of_message(name, data, number)
 
 
-class ZenohSource:
+class ZenohSource(Source):
     """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
 
     The first TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
@@ -147,12 +147,12 @@ class ZenohSource:
                 topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream]), self._make_callback(stream)
             )
 
-    def read(self, timeout_s: float) -> list[Part] | None:
-        found: list[Part] = []
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        found: list[Reading] = []
         try:
-            found += self.messages.parts_of_cdr(*self._queue.get(timeout=timeout_s))
+            found += self.messages.readings_of_cdr(*self._queue.get(timeout=timeout_s))
             while len(found) < _MAX_QUEUED_MESSAGES:
-                found += self.messages.parts_of_cdr(*self._queue.get_nowait())
+                found += self.messages.readings_of_cdr(*self._queue.get_nowait())
         except queue.Empty:
             pass
         return found

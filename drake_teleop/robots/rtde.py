@@ -7,7 +7,7 @@ import select
 import subprocess
 import sys
 import time
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.vectors import quaternion_exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
-from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
+from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Reading, Source
 
 RTDE_PORT = 30004
 _FIRST_SAMPLES_TIMEOUT_S = 10.0  # wait for the robot at the start
@@ -24,10 +24,10 @@ _RATE_MEASUREMENT_SAMPLES = 5  # samples for the rate
 _READ_BLOCK_BYTES = 65536
 
 
-class RtdeSource:
+class RtdeSource(Source):
     """Source of wrench, TCP pose and tool acceleration at rtde://HOST[?sign=-1], 500 or 125 Hz."""
 
-    streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
+    streams = WRENCH, POSE, ACCELERATION
 
     def __init__(self, address: str) -> None:
         parsed = Address(address, RTDE_PORT, allowed=("sign",))
@@ -57,9 +57,10 @@ class RtdeSource:
         spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
         self.dt = 0.002 if spacing < 0.005 else 0.008
 
-    def read(self, timeout_s: float) -> list[Part] | None:
+    def read(self, timeout_s: float) -> list[Reading] | None:
         samples, self._first = [*self._first, *self._read_samples(timeout_s)], []
-        return [part for sample in samples for part in parts_of_sample(sample, self.dt, self._sign)]
+        readings = (readings_of_sample(sample, self.dt, self._sign) for sample in samples)
+        return list(chain.from_iterable(readings))
 
     def _read_samples(self, timeout_s: float) -> list[tuple[float, ...]]:
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
@@ -98,7 +99,7 @@ class RtdeSource:
         self._stop_reader_process()
 
 
-def parts_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
+def readings_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[Reading]:
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {
@@ -106,4 +107,4 @@ def parts_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[P
         POSE: np.array([*quaternion_exponential(sample[10:13]), *sample[7:10]]),
         ACCELERATION: values[12:15],
     }
-    return [Part(stream, number, t, each) for stream, each in values_of_stream.items()]
+    return [Reading(number, t, each, stream=stream) for stream, each in values_of_stream.items()]

@@ -1,4 +1,4 @@
-"""Types of the live streams: readings, parts, compensated wrenches, flags, sources and sinks.
+"""Types of the live streams: readings, compensated wrenches, flags, sources and sinks.
 
 Readings are in the sensor frame S, in SI units, with the sign of Eq. (1): wrench of sensor on load.
 """
@@ -6,13 +6,12 @@ Readings are in the sensor frame S, in SI units, with the sign of Eq. (1): wrenc
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-_SampleT = TypeVar("_SampleT")
 NUM_READING_VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
@@ -41,11 +40,22 @@ NONZERO_WRENCH_FLAGS = (
 """Flags with a nonzero wrench."""
 
 
-class Reading(NamedTuple):
-    """Sample of wrench and motion: number, time [s] on the source's clock, values (15,), flags.
+WRENCH_AND_MOTION, WRENCH, POSE, IMU, JOINTS, ACCELERATION = (
+    *("wrench and motion", "wrench", "pose", "imu", "joints", "acceleration"),
+)
+"""Streams of readings."""
 
-    Values: wrench of sensor on load (6) [N, N m], specific force, angular velocity and acceleration
-    (3 each), in the sensor frame S. Gravity (3,) [m/s^2] in S is None without an orientation.
+
+class Reading(NamedTuple):
+    """Sample of a stream: number, time [s] on the source's clock, values, flags.
+
+    Attributes:
+        values: in S, of WRENCH_AND_MOTION (15,): wrench of sensor on load [N, N m], specific force,
+            angular velocity and acceleration. Of other streams: that wrench (6,); pose X_WF of a
+            frame on the wrist (7,); specific force and angular velocity of S (6,); joint positions
+            (n,); tool acceleration (3,).
+        gravity: (3,) in S [m/s^2]; None without an orientation.
+        arrival: time at which a reading of several streams arrived, on our clock [s].
     """
 
     number: int
@@ -53,24 +63,8 @@ class Reading(NamedTuple):
     values: Array
     flags: int = 0
     gravity: Array | None = None
-
-
-class Part(NamedTuple):
-    """Sample of one of several streams, each with its own clock.
-
-    The values are one of: the wrench in S (6); the pose X_WF of a frame on the wrist (7); specific
-    force and angular velocity of S (6); joint positions (n); a tool acceleration (3).
-    """
-
-    stream: str
-    number: int
-    t: float
-    values: Array
-    flags: int = 0
-
-
-WRENCH, POSE, IMU, JOINTS = "wrench", "pose", "imu", "joints"
-ACCELERATION = "acceleration"
+    stream: str = WRENCH_AND_MOTION
+    arrival: float = 0.0
 
 
 class CompensatedWrench(NamedTuple):
@@ -85,37 +79,28 @@ class CompensatedWrench(NamedTuple):
 
 DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_READING_VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
-DAMAGED_WRENCH_PART = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
-"""Part for invalid packets."""
+DAMAGED_WRENCH = DAMAGED_READING._replace(values=np.full(6, np.nan), stream=WRENCH)
+"""Reading for invalid packets with a wrench alone."""
 
 
-class Source(Protocol[_SampleT]):
-    """Interface of a source of readings, or of other samples.
+class Source(Protocol):
+    """Interface of a source of readings.
 
     Attributes:
-        dt: period of the samples [s].
-        live: whether they arrive in real time; else as fast as they are read.
+        dt: period of the wrenches [s].
+        live: whether the readings arrive in real time; else as fast as they are read.
+        streams: WRENCH_AND_MOTION, or the streams to assemble.
     """
 
     dt: float
-    live: bool
+    live: bool = True
+    streams: tuple[str, ...] = (WRENCH_AND_MOTION,)
 
-    def read(self, timeout_s: float) -> list[_SampleT] | None:
-        """Return the samples after waiting for the first; [] after the timeout, None at the end."""
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """Return the readings after a wait for the first; [] after the timeout, None at the end."""
 
     def close(self) -> None:
         return
-
-
-class PartSource(Protocol):
-    """Interface of a source of parts; `dt` [s] is the period of the wrenches."""
-
-    dt: float
-    streams: tuple[str, ...]
-
-    def read(self, timeout_s: float) -> list[Part] | None: ...
-
-    def close(self) -> None: ...
 
 
 class Sink(Protocol):

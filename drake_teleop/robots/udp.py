@@ -11,15 +11,16 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    DAMAGED_WRENCH_PART,
+    DAMAGED_WRENCH,
+    POSE,
+    WRENCH,
     CompensatedWrench,
-    Part,
     Reading,
     ReadingFlag,
+    Source,
 )
 
 LOCALHOST = "127.0.0.1"
@@ -47,18 +48,18 @@ def unpack_reading(packet: bytes) -> Reading:
     return Reading(number, t, values, flags & _SATURATED_FLAG)
 
 
-def pack_parts(wrench: Part, pose: Part) -> bytes:
+def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
     head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
     return POSED_FORMAT.pack(*head, *wrench.values, *pose.values)
 
 
-def unpack_parts(packet: bytes) -> list[Part]:
+def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
     if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
-        return [DAMAGED_WRENCH_PART]
+        return [DAMAGED_WRENCH]
     _, flags, number, t = _PACKET_HEADER.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _PACKET_HEADER.size).astype(np.float64)
-    wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED_FLAG)
-    return [wrench, Part(streams.POSE, number, t, values[6:])]
+    wrench = Reading(number, t, values[:6], flags & _SATURATED_FLAG, stream=WRENCH)
+    return [wrench, Reading(number, t, values[6:], stream=POSE)]
 
 
 def pack_wrench(out: CompensatedWrench) -> bytes:
@@ -102,7 +103,7 @@ def open_udp_receiver(host: str, port: int) -> socket.socket:
     return receiver
 
 
-class _PacketReceiver:
+class _PacketReceiver(Source):
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = open_udp_receiver(*host_and_port(address))
@@ -127,8 +128,6 @@ class _PacketReceiver:
 class UdpSource(_PacketReceiver):
     """Source of readings at udp://[HOST]:PORT."""
 
-    live = True
-
     def read(self, timeout_s: float) -> list[Reading] | None:
         return [unpack_reading(packet) for packet in self.receive_packets(timeout_s)]
 
@@ -136,18 +135,18 @@ class UdpSource(_PacketReceiver):
 class PosedSource(_PacketReceiver):
     """Source of wrenches and poses at posed://[HOST]:PORT[?sign=-1]."""
 
-    streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
+    streams = WRENCH, POSE
 
     def __init__(self, address: str, dt: float) -> None:
         self._sign = Address(address, None, allowed=("sign",), host=LOCALHOST).wrench_sign()
         super().__init__(address, dt)
 
-    def read(self, timeout_s: float) -> list[Part] | None:
-        parts = [
-            part for packet in self.receive_packets(timeout_s) for part in unpack_parts(packet)
-        ]
-        signs = {streams.WRENCH: self._sign}
-        return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        found: list[Reading] = []
+        for packet in self.receive_packets(timeout_s):
+            wrench, *pose = unpack_wrench_and_pose(packet)
+            found += [wrench._replace(values=self._sign * wrench.values), *pose]
+        return found
 
 
 class UdpSink:

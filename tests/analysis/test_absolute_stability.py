@@ -61,60 +61,6 @@ def test_llewellyn_agrees_with_search_over_lossless_loads():
         assert not (is_stable and displayed.min() < 0)
 
 
-def random_station(rng: np.random.Generator) -> OneAxis:
-    return OneAxis(
-        device_mass=rng.uniform(0.05, 2.0),
-        device_damping=rng.uniform(0.1, 10.0),
-        slave_mass=rng.uniform(1.0, 30.0),
-        position_gain=rng.uniform(20.0, 100.0),
-        velocity_gain=rng.uniform(100.0, 600.0),
-        tool_mass=rng.uniform(0.2, 5.0),
-        force_scale=rng.uniform(0.05, 2.0),
-        position_scale=rng.uniform(0.2, 3.0),
-        sigma=rng.uniform(0.0, 2.0),
-        gamma=rng.uniform(0.2, 2.0),
-        delay=rng.choice([0.0, rng.uniform(0.0, 0.1)]),
-    )
-
-
-def test_worst_loads_are_unstable_where_llewellyn_fails():
-    """300 stations: the worst loads give a root in the right half plane."""
-    rng = np.random.default_rng(3)
-    proven = 0
-    while proven < 300:
-        axis = random_station(rng)
-        H = tp.hybrid_matrix(axis, S)
-        failing = np.flatnonzero(~ab.is_absolutely_stable(H))
-        if not failing.size:
-            continue
-        i = rng.choice(failing)
-        w, loads = OMEGA[i], ab.worst_loads(H[i])
-        assert loads.loop_resistance < 0
-
-        def environment(s, x=loads.environment_reactance, w=w):
-            return s * x / w if x > 0 else -w * x / s
-
-        def displayed(s, axis=axis, environment=environment):
-            return tp.transmitted_impedance(tp.hybrid_matrix(axis, s), environment(s))
-
-        # The hand's reactance is made of a spring and a mass that dominates the loop's.
-        slope = abs(displayed(1j * w * 1.0001) - displayed(1j * w)) / (1e-4 * w)
-        mass = max(100 * slope, 100 * abs(loads.loop_resistance) / w, abs(loads.hand_reactance) / w)
-        spring = mass * w**2 - loads.hand_reactance * w
-        assert spring >= 0
-
-        def around(s, mass=mass, spring=spring, displayed=displayed):
-            return mass * s + spring / s + displayed(s)
-
-        s = 1j * w - loads.loop_resistance / (2 * mass)
-        for _ in range(20):
-            step = 1e-6 * abs(s)
-            s = s - around(s) * 2 * step / (around(s + step) - around(s - step))
-        assert abs(around(s)) < 1e-8 * abs(mass * s)
-        assert s.real > 0
-        proven += 1
-
-
 def test_passive_implies_absolutely_stable_but_not_the_reverse():
     H = random_two_ports(20000, 4)
     passive, stable = ab.is_passive(H), ab.is_absolutely_stable(H)
@@ -160,8 +106,8 @@ def test_position_force_is_not_absolutely_stable_even_without_delay():
     # 890 is the value at 10^4 rad/s; it grows without limit, k_f m_s w / 2.
     assert np.argmax(needed) == len(omega) - 1
     for w in (1e5, 1e6):
-        largest_valid = ab.required_damping(pd_station(np.array([w]), axis))[0]
-        assert largest_valid == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
+        damping = ab.required_damping(pd_station(np.array([w]), axis))[0]
+        assert damping == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
     # It is the damping at which no lossless load gives a negative resistance.
     some = slice(1000, None, 100)
     less = tp.absorb_impedances(H, hand=0.999 * needed)
@@ -228,53 +174,33 @@ def members(hand: ab.ImpedanceRange, wall: ab.ImpedanceRange, n: int):
     return points[:, :3], points[:, 3:]
 
 
-def test_can_oscillate_finds_a_region_inside_the_other():
-    """No edges cross, but a member oscillates."""
-    direct, omega = tp.two_port_matrix(np.zeros(1), 1.0, -1.0, 0.0), np.array([2.0])  # Z_to = Z_e
-    large = ab.ImpedanceRange((-10.0, 10.0), (-10.0, 10.0), (0.0, 0.0))
-    small = ab.ImpedanceRange((0.9, 1.1), (-1.1, -0.9), (0.0, 0.0))
-    mirrored = ab.ImpedanceRange((-1.1, -0.9), (0.9, 1.1), (0.0, 0.0))
-    assert ab.can_oscillate(direct, omega, large, small)[0]
-    assert ab.can_oscillate(direct, omega, small, large)[0]
-    assert ab.can_oscillate(direct, omega, small, mirrored)[0]
-    assert not ab.can_oscillate(direct, omega, small, small)[0]
-
-
-def random_ranges(rng: np.random.Generator) -> tuple[ab.ImpedanceRange, ab.ImpedanceRange]:
-    def between(low, high):
-        return tuple(np.sort(np.exp(rng.uniform(np.log(low), np.log(high), 2))))
-
-    hand = ab.ImpedanceRange(between(0.05, 2.0), between(0.3, 30.0), between(10.0, 1000.0))
-    wall = ab.ImpedanceRange((0.0, 0.0), between(1.0, 100.0), between(10.0, 30000.0))
-    return hand, wall
-
-
-def test_ranges_without_delay_agree_with_roots_of_their_members():
-    """Some pair oscillates if and only if some members are stable and some are not."""
+def test_stiffness_limit_without_delay_agrees_with_roots_of_members():
     rng = np.random.default_rng(7)
-    omega = np.geomspace(0.1, 3000.0, 1500)
-    counts = np.zeros((2, 2), dtype=int)
-    while counts.sum() < 40:
+    omega, limited = np.geomspace(0.1, 3000.0, 6000), 0
+    for _ in range(40):
         axis = OneAxis(
             force_scale=rng.uniform(0.05, 1.0),
             sigma=rng.uniform(0, 1),
             slave_mass=rng.uniform(4, 20),
         )
-        hand, wall = random_ranges(rng)
-        growth = roots(axis, *members(hand, wall, 5))
-        if np.max(growth) < 0 and np.max(growth) > -0.02 * abs(np.min(growth)):
-            continue  # The grid of members is too coarse.
+        mass, damping, stiffness = (
+            tuple(np.sort(np.exp(rng.uniform(np.log(low), np.log(high), 2))))
+            for low, high in ((0.05, 2.0), (0.3, 30.0), (10.0, 1000.0))
+        )
+        hand = ab.ImpedanceRange(mass, damping, stiffness)
         H = tp.hybrid_matrix(axis, 1j * omega)
-        oscillates = np.any(ab.can_oscillate(H, omega, hand, wall))
-        mixed = np.min(growth) < 0 < np.max(growth)
-        counts[int(mixed), int(oscillates)] += 1
-        if not oscillates:
-            assert not mixed
-        if np.max(ab.bounded_singular_value(H, omega, hand, wall)) < 1:
-            assert not oscillates
-    assert counts[0, 1] == 0
-    assert counts[1, 0] == 0
-    assert np.all(np.diag(counts) > 8)
+        limit = np.min(ab.stiffness_limit(H, omega, hand))
+
+        def growth(walls, hand=hand, axis=axis):
+            wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 0.0), walls)
+            return np.max(roots(axis, *members(hand, wall, 5)))
+
+        if limit > 0.0:
+            limited += limit < 1e5
+            assert growth((0.0, min(0.98 * limit, 1e5))) < 0
+        if 0.0 < limit < 1e5:
+            assert growth((1.02 * limit, 1.1 * limit)) > 0
+    assert limited > 8
 
 
 def first_crossing(mass, damping, stiffness, contact):
@@ -285,33 +211,6 @@ def first_crossing(mass, damping, stiffness, contact):
         w = np.sqrt((-b + np.sqrt(b**2 - 4 * a * c)) / (2 * a))
         trip = np.arctan2(damping * w, mass * w**2 - stiffness) / w
     return np.where(np.isnan(trip), np.inf, trip)
-
-
-@pytest.mark.parametrize(
-    "hand",
-    [ab.impedance_range_of_grips(), ab.ImpedanceRange((0.099, 0.101), (1.98, 2.02), (49.0, 51.0))],
-    ids=["all grips", "light grip"],
-)
-def test_ranges_with_delay_agree_with_closed_form_of_their_members(hand):
-    axis = OneAxis(ideal_servo=True)
-    wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 0.0), (4000.0, 5100.0))
-    hands, walls = members(hand, wall, 9)
-    trips = first_crossing(
-        hands[:, 0] + axis.device_mass,
-        hands[:, 1] + axis.device_damping,
-        hands[:, 2],
-        axis.force_scale * walls[:, 1],
-    )
-    omega = np.linspace(5.0, 120.0, 3000)
-
-    def quiet(delay):
-        H = tp.hybrid_matrix(OneAxis(ideal_servo=True, delay=delay), 1j * omega)
-        return not np.any(ab.can_oscillate(H, omega, hand, wall))
-
-    first = np.min(trips) / 2
-    assert all(quiet(share * first) for share in (0.0, 0.3, 0.8, 0.998))
-    assert not quiet(1.002 * first)
-    assert 2 * first == pytest.approx(0.0087, rel=0.02)  # Light grip against the leaf.
 
 
 def largest_valid(holds, high):
@@ -339,15 +238,10 @@ def test_disc_criterion_is_conservative_by_the_known_factor():
         def wall(stiffness):
             return ab.ImpedanceRange((0.0, 0.0), (0.0, 0.1), (0.0, stiffness))
 
-        def quiet(stiffness, H=H):
-            return not np.any(ab.can_oscillate(H, omega, hand, wall(stiffness)))
-
         def small(stiffness, H=H):
             return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
 
-        largest, sufficient = largest_valid(quiet, 1e4), largest_valid(small, 1e4)
-        limit = np.min(ab.stiffness_limit(H, omega, hand))
-        assert limit == pytest.approx(largest, rel=2e-3)
+        largest, sufficient = np.min(ab.stiffness_limit(H, omega, hand)), largest_valid(small, 1e4)
         assert largest == pytest.approx(exact, rel=0.02)
         assert 0.9 * largest < sufficient < largest
 

@@ -11,9 +11,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis import analyze
 from drake_teleop.lab.analysis import figures as of_summary
 from drake_teleop.lab.analysis.maps import stability_map
-from drake_teleop.lab.analysis.report import print_tables
+from drake_teleop.lab.analysis.report import print_tables, verdict_sentences
 from drake_teleop.lab.analysis.task_direction import task_direction
-from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 pytestmark = pytest.mark.long

@@ -7,13 +7,8 @@ import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.linearization import (
-    COMPONENT_NAMES,
-    Linearization,
-    hybrid_along,
-    linearize,
-    linearize_station,
-)
+from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
+from drake_teleop.lab.analysis.linearization import hybrid_along, linearize, linearize_station
 from drake_teleop.lab.analysis.one_axis import device_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction

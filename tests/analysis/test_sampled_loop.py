@@ -20,7 +20,6 @@ from drake_teleop.lab.analysis.cut_loop import (
     count_unstable_multipliers,
     cut_loop,
     delay_margin,
-    dominant_multiplier,
     gain_and_phase_margin,
     loop_response,
 )
@@ -33,8 +32,8 @@ from drake_teleop.lab.analysis.period_map import (
     SLAVE_V,
     SLAVE_X,
     Sampling,
-    _mass_spring_motion,
     delay_in_hand_periods,
+    mass_spring_motion,
     period_map_of_cut_loop,
     sampled_two_port,
 )
@@ -203,38 +202,6 @@ def test_argument_principle_agrees_with_eigenvalues(
         assert count == (size > 1).sum()
 
 
-@settings(max_examples=60, deadline=None)
-@given(axis=axes, steps=st.integers(0, 60), low_pass=st.booleans())
-def test_the_dominant_multiplier_is_the_largest_eigenvalue(
-    axis: OneAxis, steps: int, low_pass: bool
-) -> None:
-    sampling = JR3 if low_pass else STATION
-    delay = steps / sampling.hand_hz
-    values = multipliers(replace(axis, delay=delay), sampling)
-    largest = np.abs(values).max()
-    # Any of several equally large ones is valid; a double one has half the digits.
-    alike = values[np.abs(values) > largest - 1e-7]
-    found = dominant_multiplier(cut_loop(axis, sampling), delay)
-    assert abs(found) == pytest.approx(largest, abs=1e-8)
-    assert np.abs(alike.real + 1j * np.abs(alike.imag) - found).min() < 1e-6
-
-
-def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
-    """A delay of two seconds in one direction would be 8000 registers."""
-    loop = cut_loop(replace(OneAxis(), sigma=np.array([0.0, 1.0])), STATION)
-    delay = np.array([[0.02], [2.0]])
-    found = dominant_multiplier(loop, delay)
-    assert found.shape == (2, 2)
-    back = 1 - np.prod(
-        (found[..., None] - loop.closed_multipliers) / (found[..., None] - loop.open_multipliers),
-        axis=-1,
-    )
-    np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
-    one = growth_rate(OneAxis(delay=0.02), STATION)
-    assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
-    assert ((np.abs(found) > 1) == (count_unstable_multipliers(loop, delay) > 0)).all()
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     poles=st.lists(st.floats(-1.2, 1.2), min_size=2, max_size=4),
@@ -361,7 +328,7 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(
-        _mass_spring_motion(w**2, 0.0, np.array([t])),
+        mass_spring_motion(w**2, 0.0, np.array([t])),
         ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
         strict=True,
     ):

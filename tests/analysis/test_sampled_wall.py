@@ -73,8 +73,7 @@ def test_a_pole_leaves_the_circle_at_stable_stiffness(mass, b, ratio, hand):
     B = ratio * b
     K = float(stable_stiffness(mass, b, B, PERIOD, hand_stiffness=hand))
     radius = [
-        np.abs(sampled_poles(mass, b, f * K, B, PERIOD, hand_stiffness=hand)).max()
-        for f in (0.3, 0.999, 1.001)
+        np.abs(sampled_poles(mass, b, hand, f * K, B, PERIOD)).max() for f in (0.3, 0.999, 1.001)
     ]
     if K:
         assert radius[0] < 1 and radius[1] < 1 < radius[2]
@@ -115,7 +114,7 @@ def test_sampled_poles_predict_growth_of_a_simulation():
                 a = -(b * middle + 300.0 * (x + h / 2 * v) + force) / mass
                 x, v = x + h * middle, v + h * a
             sizes.append(abs(x))
-        poles = sampled_poles(mass, b, ratio * limit, B, PERIOD, hand_stiffness=300.0)
+        poles = sampled_poles(mass, b, 300.0, ratio * limit, B, PERIOD)
         rate = np.log(np.max(sizes[-600:]) / np.max(sizes[-1800:-1200])) / 1200
         assert rate == pytest.approx(np.log(np.abs(poles).max()), rel=0.02)
 

@@ -13,7 +13,7 @@ import sockets
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 from test_peers import ADDRESS, peer
-from test_reading_assembly import X_FS, StreamStub, truth
+from test_reading_assembly import X_FS, truth
 
 from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
@@ -27,15 +27,14 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.assembly import PartStreams
 from drake_teleop.robots.calibration import (
     RecordEvaluation,
     advise_motion,
     calibrate,
     evaluate_record,
 )
-from drake_teleop.robots.recording import PartRecorder, ReadingRecorder
-from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.recording import Recorder
+from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Reading, ReadingFlag
 
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -80,7 +79,7 @@ class Stream:
 
 def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
-    recorder = ReadingRecorder()
+    recorder = Recorder()
     looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, TOLERANCE)
     assert recorder.longest_part_s < 8.0
     assert [at.is_within_tolerance.all() for at in looks[-3:]] == [False, True, True]
@@ -111,12 +110,12 @@ class FailingStream(Stream):
 
 
 def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> None:
-    path = tmp_path / ReadingRecorder.log_file_name
+    path = tmp_path / "log.parquet"
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-            calibrate(FailingStream(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
+            calibrate(FailingStream(recorded(seconds, [0])), Recorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(FailingStream(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # no data
+        calibrate(FailingStream(recorded(0.0, [0])), Recorder(), path, TOLERANCE)  # no data
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
@@ -205,7 +204,7 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
 
 
 def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: Path) -> None:
-    rows, recorder = recorded(1.0, [0]), ReadingRecorder(np.full(6, 80.0))
+    rows, recorder = recorded(1.0, [0]), Recorder(largest=np.full(6, 80.0))
     broken = rows[3].copy()
     broken[1], rows[5, 0] = np.nan, 80.0
     for reading in (Reading(0, 0.0, rows[0]), DAMAGED_READING, Reading(1, DT, broken),
@@ -220,7 +219,7 @@ def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: P
     assert recorder.left_out == 4
 
 
-def take(recorder: ReadingRecorder, *clocks: tuple[float, int]) -> ReadingRecorder:
+def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
     """Record a number of readings from each start time."""
     number = 0
     for start, count in clocks:
@@ -233,7 +232,7 @@ def take(recorder: ReadingRecorder, *clocks: tuple[float, int]) -> ReadingRecord
 @pytest.mark.parametrize("wrong", [1e6, -1e6, 1e300, 20.0, 0.0])
 @pytest.mark.parametrize("count", [1, 2, 49])
 def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -> None:
-    recorder = take(ReadingRecorder(), (10.0, 800), (wrong, count), (14.0, 200))
+    recorder = take(Recorder(), (10.0, 800), (wrong, count), (14.0, 200))
     assert (recorder.left_out, recorder.clock_changes) == (count, 0)
     assert recorder.longest_part_s == pytest.approx(4.0 + 199 * DT)
 
@@ -242,7 +241,7 @@ def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -
 def test_longest_part_is_written_after_a_clock_change(
     first: int, second: int, tmp_path: Path
 ) -> None:
-    recorder = take(ReadingRecorder(), (0.0, first), (1e6, 1), (500.0, second))
+    recorder = take(Recorder(), (0.0, first), (1e6, 1), (500.0, second))
     assert (recorder.left_out, recorder.clock_changes) == (1, 1)
     assert recorder.longest_part_s == pytest.approx(799 * DT)
     recorder.write(tmp_path / recorder.log_file_name)
@@ -250,15 +249,15 @@ def test_longest_part_is_written_after_a_clock_change(
 
 
 def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
-    recorder = PartRecorder(PartStreams(StreamStub(WRENCH), StreamStub(POSE)), None, X_FS)
+    recorder = Recorder((WRENCH, POSE), None, X_FS, two_clocks=True)
     pose, wrench = np.eye(7)[0], np.ones(6)
     for k in range(1000):
-        recorder.add((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
-        recorder.add((Part(POSE, k, 1e4 + DT * k, pose), DT * k))
+        recorder.add(Reading(k, 1e7 if k == 400 else DT * k, wrench, stream=WRENCH, arrival=DT * k))
+        recorder.add(Reading(k, 1e4 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     for k in range(100):  # both clocks were set
-        recorder.add((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
-        recorder.add((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
+        recorder.add(Reading(k, 70.0 + DT * k, wrench, stream=WRENCH, arrival=DT * k))
+        recorder.add(Reading(k, 90.0 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.clock_changes <= 2
 
@@ -290,18 +289,16 @@ def posed(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Path) -> None:
     """The stamps of the motion are 4 ms late and from another clock."""
-    recorder = PartRecorder(
-        PartStreams(StreamStub(WRENCH), StreamStub(POSE)), np.full(6, 80.0), X_FS
-    )
+    recorder = Recorder((WRENCH, POSE), np.full(6, 80.0), X_FS, two_clocks=True)
     late, clock = 0.004, 1e4
     for k, (t, wrench, pose) in enumerate(zip(*posed(2.0), strict=True)):
-        recorder.add((Part(WRENCH, k, t, wrench), t + 0.001))
-        recorder.add((Part(POSE, k, t + clock + late, pose), t + late + 0.001))
+        recorder.add(Reading(k, t, wrench, stream=WRENCH, arrival=t + 0.001))
+        recorder.add(Reading(k, t + clock + late, pose, stream=POSE, arrival=t + late + 0.001))
     bad = np.full(6, 80.0), np.full(7, np.nan), np.full(7, 0.9)
     for stream, values, flags in zip(
         (WRENCH, POSE, POSE), bad, (0, 0, ReadingFlag.DAMAGED), strict=True
     ):
-        recorder.add((Part(stream, 0, 2.1, values, int(flags)), 2.1))
+        recorder.add(Reading(0, 2.1, values, int(flags), stream=stream, arrival=2.1))
     assert recorder.left_out == 3 and recorder.clock_changes == 0
     recorder.write(tmp_path / recorder.log_file_name)
     found = identify_log(tmp_path / recorder.log_file_name)

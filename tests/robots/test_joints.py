@@ -21,10 +21,10 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance, required_values, tolerances_in_units
-from drake_teleop.robots.assembly import PartStreams, PoseSourceFromJoints, ReadingAssembler
+from drake_teleop.robots.assembly import PoseSourceFromJoints, ReadingAssembler, ReadingStreams
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
-from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
+from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Reading
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.plant import read_arm_kinematics
 
@@ -93,21 +93,21 @@ def test_pose_equals_drake(model: Path) -> None:
 def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
     messages = CdrConverter(1.0, joints=NAMES)
     sent = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
-    (part,) = messages.parts_of_cdr(JOINTS, sent, b"")
+    (part,) = messages.readings_of_cdr(JOINTS, sent, b"")
     assert part.stream == JOINTS and part.t == 5.25
     np.testing.assert_array_equal(part.values, [1.0, 2.0, 3.0, 4.0])
-    assert messages.parts_of_cdr(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
-    assert messages.parts_of_cdr(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
+    assert messages.readings_of_cdr(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
+    assert messages.readings_of_cdr(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
 
 
 class JointSource(StreamStub):
     """Source of given parts."""
 
-    def __init__(self, parts: list[Part]) -> None:
+    def __init__(self, parts: list[Reading]) -> None:
         super().__init__(WRENCH, JOINTS, POSE)
         self._parts = parts
 
-    def read(self, timeout_s: float) -> list[Part]:
+    def read(self, timeout_s: float) -> list[Reading]:
         return self._parts
 
 
@@ -115,17 +115,17 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     arm = read_arm_kinematics(model, "tool")
     assert arm is not None
     t, *joints = moved(0.4)
-    bad = Part(POSE, 0, 0.0, np.zeros(7)), Part(JOINTS, 0, 0.0, np.full(3, 0.1))
-    parts = [Part(JOINTS, k, float(t[k]), q) for k, q in enumerate(joints[0])]
+    bad = Reading(0, 0.0, np.zeros(7), stream=POSE), Reading(0, 0.0, np.full(3, 0.1), stream=JOINTS)
+    parts = [Reading(k, float(t[k]), q, stream=JOINTS) for k, q in enumerate(joints[0])]
     source = PoseSourceFromJoints(JointSource([*bad, *parts]), arm)
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = ReadingAssembler(PartStreams(source)), []
+    assembly, found = ReadingAssembler(ReadingStreams(source)), []
     for k, part in enumerate(sent[1:]):
-        found += assembly.readings_completed_by(part, part.t) + assembly.readings_completed_by(
-            Part(WRENCH, k, part.t, np.zeros(6)), part.t
-        )
+        wrench = Reading(k, part.t, np.zeros(6), stream=WRENCH, arrival=part.t)
+        for each in (part._replace(arrival=part.t), wrench):
+            found += assembly.readings_completed_by(each)
     good = [each for each in found if not each.flags]
     wanted = motion_of(arm.table, tuple(joints))[[each.number for each in good]]
     motion = np.array([each.values[6:] for each in good])

@@ -35,8 +35,8 @@ from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,
     WRENCH,
+    WRENCH_AND_MOTION,
     CompensatedWrench,
-    Part,
     Reading,
     ReadingFlag,
     Source,
@@ -74,7 +74,7 @@ class LoopOutputs(list[CompensatedWrench]):
     ) -> None:
         """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
-        self.parts: list[Part] = []
+        self.parts: list[Reading] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
         compensator.offsets = OFFSETS - non_contact_wrench(*np.split(AT_REST, 3), PHI)
         begun, until = False, time.monotonic() + seconds
@@ -86,7 +86,7 @@ class LoopOutputs(list[CompensatedWrench]):
             self.parts += parts
             for part in parts:
                 reading = part
-                if isinstance(part, Part):
+                if part.stream != WRENCH_AND_MOTION:
                     if part.stream != WRENCH:
                         continue
                     values = np.concatenate([part.values, AT_REST])
@@ -254,7 +254,7 @@ def test_netft_with_another_rate_has_only_the_rate_flag(real_hz: float, named: b
     compensator, flags = Compensator(load(), source.dt), []
     for k in range(round(2.5 * real_hz)):
         now = k / real_hz
-        part = source.part_of_packet(struct.pack(">III6i", k, k, 0, *range(6)), now)
+        part = source.reading_of_packet(struct.pack(">III6i", k, k, 0, *range(6)), now)
         values = np.concatenate([part.values, AT_REST])
         flags.append(compensator.step(Reading(part.number, part.t, values, part.flags), now).flags)
     source.close()
@@ -271,10 +271,10 @@ def test_netft_with_another_rate_has_only_the_rate_flag(real_hz: float, named: b
 def test_netft_status_and_repeated_samples_are_flagged(status: int, flag: int, still: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
     counts = [2, -4, 6, 4, -8, 12]
-    source.part_of_packet(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)
+    source.reading_of_packet(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)
     for after, stale in ((0.049, 0), (0.051, ReadingFlag.STALE)):
         record = struct.pack(">III6i", 2, 7 + (not still), status, *counts)
-        part = source.part_of_packet(record, after)
+        part = source.reading_of_packet(record, after)
         assert part.flags == flag | (stale if still else 0)
         np.testing.assert_array_equal(part.values, [-1, 2, -3, -1, 2, -3])
     source.close()

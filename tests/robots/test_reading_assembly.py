@@ -12,10 +12,10 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import PartStreams, ReadingAssembler, pose_from_rpy
+from drake_teleop.robots.assembly import ReadingAssembler, ReadingStreams, pose_from_rpy
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_source
-from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.streams import IMU, POSE, WRENCH, Reading, ReadingFlag
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
 X_FS = np.array([math.cos(0.3), 0.0, math.sin(0.3), 0.0, 0.02, -0.03, 0.08])
@@ -52,16 +52,16 @@ class StreamStub:
     def __init__(self, *streams: str) -> None:
         self.dt, self.streams = DT, streams
 
-    def read(self, timeout_s: float) -> list[Part]:
+    def read(self, timeout_s: float) -> list[Reading]:
         return []
 
     def close(self) -> None:
         pass
 
 
-def wrench_at(t: float, k: int) -> Part:
+def wrench_at(t: float, k: int) -> Reading:
     motion = np.split(truth(t)[1], 3)
-    return Part(WRENCH, k, t, non_contact_wrench(*motion, PHI) + OFFSETS)
+    return Reading(k, t, non_contact_wrench(*motion, PHI) + OFFSETS, stream=WRENCH)
 
 
 def played(
@@ -72,15 +72,17 @@ def played(
     for k in range(round(seconds / DT)):
         t = k * DT
         if k % 2 == 0 and not lost(k):
-            found += assembly.readings_completed_by(Part(POSE, k // 2, t + later, truth(t)[0]), t)
-        found += assembly.readings_completed_by(wrench_at(t, k), t)
+            found += assembly.readings_completed_by(
+                Reading(k // 2, t + later, truth(t)[0], stream=POSE, arrival=t)
+            )
+        found += assembly.readings_completed_by(wrench_at(t, k)._replace(arrival=t))
     return found
 
 
 @pytest.mark.parametrize("lost", [lambda k: False, lambda k: k % 14 == 0])
 def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
     found = played(
-        ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost
+        ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost
     )
     good = [each for each in found if not each.flags]
     assert len(good) > 200 and good[-1].t > 0.4 - 0.035  # half a window late
@@ -98,7 +100,7 @@ def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
 def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
     """The removed weight has the same orientation, so that only mass times acceleration remains."""
     assembly = ReadingAssembler(
-        PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, weight_removed=True
+        ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, weight_removed=True
     )
     found = [each for each in played(assembly, 0.4) if not each.flags]
     rest, left = np.zeros(3), []
@@ -109,27 +111,27 @@ def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
         left.append(each.values[:6] - weight - OFFSETS - non_contact_wrench(*motion, PHI))
     assert len(left) > 200 and np.abs(left).max() < 0.03
     with pytest.raises(DrakeTeleopError, match="without an orientation"):
-        ReadingAssembler(PartStreams(StreamStub(WRENCH, IMU)), weight_removed=True)
+        ReadingAssembler(ReadingStreams(StreamStub(WRENCH, IMU)), weight_removed=True)
     weightless = dataclasses.replace(load(), weight_removed=True)
     with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
         open_source("udp://:0", weightless, rate_hz=500.0)
 
 
 def test_motion_on_another_clock_is_synchronised() -> None:
-    apart = ReadingAssembler(PartStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
-    same = ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    apart = ReadingAssembler(ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
+    same = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
     good = [each.values for each in a if not each.flags], [x.values for x in b if not x.flags]
     np.testing.assert_allclose(good[0][-150:], good[1][-150:], atol=1e-4)
     late = ReadingAssembler(
-        PartStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
+        ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
     )
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
     np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
 
 
 def test_readings_are_stale_without_poses_and_recover() -> None:
-    assembly = ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
     assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
     assert {each.flags for each in found} == {0, int(ReadingFlag.STALE)}
@@ -137,7 +139,7 @@ def test_readings_are_stale_without_poses_and_recover() -> None:
 
 
 def test_invalid_and_out_of_order_poses_are_ignored() -> None:
-    assembly = ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     played(assembly, 0.3)
     for values, t in (
         (np.full(7, math.nan), 0.3),
@@ -145,29 +147,30 @@ def test_invalid_and_out_of_order_poses_are_ignored() -> None:
         (truth(0.3)[0], math.nan),
         (truth(0.3)[0], math.inf),
     ):
-        assert assembly.readings_completed_by(Part(POSE, 0, t, values), 0.3) == []
+        assert assembly.readings_completed_by(Reading(0, t, values, stream=POSE, arrival=0.3)) == []
     after = [
         each
         for k in range(300, 400)
-        for each in assembly.readings_completed_by(wrench_at(k * DT, k), k * DT)
+        for each in assembly.readings_completed_by(wrench_at(k * DT, k)._replace(arrival=k * DT))
     ]
-    assert after == []  # motion is unknown
+    assert after == []  # unknown motion
 
 
 def test_assembly_accepts_a_clock_that_is_set_back() -> None:
-    assembly = ReadingAssembler(PartStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     compensator = Compensator(load(), DT)
     for each in played(assembly, 0.2):
         compensator.step(each, each.t + 0.03)
     out = []
     for k in range(300):
         t, now = k * DT - 50.0, 0.2 + k * DT
-        parts = [Part(WRENCH, 200 + k, t, wrench_at(t, 0).values)]
+        parts = [Reading(200 + k, t, wrench_at(t, 0).values, stream=WRENCH)]
         if k % 2 == 0:
-            parts.insert(0, Part(POSE, k, t, truth(t)[0]))
+            parts.insert(0, Reading(k, t, truth(t)[0], stream=POSE))
         for part in parts:
             out += [
-                compensator.step(each, now) for each in assembly.readings_completed_by(part, now)
+                compensator.step(each, now)
+                for each in assembly.readings_completed_by(part._replace(arrival=now))
             ]
     left = [row.contact for row in out if not row.flags]
     assert len(left) > 50 and np.abs(left).max() < 0.03
@@ -175,11 +178,13 @@ def test_assembly_accepts_a_clock_that_is_set_back() -> None:
 
 
 def test_imu_gives_the_motion() -> None:
-    assembly, found = ReadingAssembler(PartStreams(StreamStub(WRENCH, IMU))), []
+    assembly, found = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, IMU))), []
     for k in range(250):
         t = k * DT
-        found += assembly.readings_completed_by(Part(IMU, k, t, truth(t)[1][:6]), t)
-        found += assembly.readings_completed_by(wrench_at(t, k), t)
+        found += assembly.readings_completed_by(
+            Reading(k, t, truth(t)[1][:6], stream=IMU, arrival=t)
+        )
+        found += assembly.readings_completed_by(wrench_at(t, k)._replace(arrival=t))
     good = [each for each in found if not each.flags]
     wanted = np.array([truth(each.t)[1] for each in good])
     motion = np.array([each.values[6:] for each in good])
@@ -188,7 +193,7 @@ def test_imu_gives_the_motion() -> None:
 
 def test_wrench_without_motion_is_refused() -> None:
     with pytest.raises(DrakeTeleopError, match="delivers no motion; give --motion"):
-        ReadingAssembler(PartStreams(StreamStub(WRENCH)))
+        ReadingAssembler(ReadingStreams(StreamStub(WRENCH)))
 
 
 @pytest.mark.parametrize("angles", [(20.0, -35.0, 110.0), (0.0, 80.0, 30.0), (-170.0, 5.0, 0.0)])

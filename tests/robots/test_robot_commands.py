@@ -19,7 +19,7 @@ from test_calibrate import DT, PHI, recorded
 from test_compensator import OFFSETS, load, resting
 
 from drake_teleop.robots import udp
-from drake_teleop.robots.streams import POSE, WRENCH, CompensatedWrench, Part, Reading
+from drake_teleop.robots.streams import POSE, WRENCH, CompensatedWrench, Reading
 
 pytestmark = pytest.mark.slow
 TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
@@ -131,8 +131,9 @@ def test_documented_compensate_command_eliminates_the_tool(in_folder, answers, c
 def test_documented_compensate_command_works_with_poses(in_folder, answers) -> None:
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.1, 0.3])
     packets = [
-        udp.pack_parts(
-            Part(WRENCH, row.number, row.t, -row.values[:6]), Part(POSE, row.number, row.t, pose)
+        udp.pack_wrench_and_pose(
+            Reading(row.number, row.t, -row.values[:6], stream=WRENCH),
+            Reading(row.number, row.t, pose, stream=POSE),
         )
         for row in touched(300)
     ]

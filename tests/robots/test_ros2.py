@@ -144,9 +144,9 @@ def test_static_and_moving_transforms_form_a_chain() -> None:
         )
 
     converter = MessageConverter(1.0, ("base", "sensor"))
-    assert converter.parts_of_message("tf", transforms("flange", "base", 0.5, 3), 1) == []
+    assert converter.readings_of_message("tf", transforms("flange", "base", 0.5, 3), 1) == []
     converter.add_transforms(transforms("sensor", "flange", 0.1, 0))
-    (part,) = converter.parts_of_message("tf", transforms("flange", "base", 0.7, 4), 2)
+    (part,) = converter.readings_of_message("tf", transforms("flange", "base", 0.7, 4), 2)
     assert (part.stream, part.number, part.t) == (POSE, 2, 4.0)
     np.testing.assert_allclose(part.values, [1, 0, 0, 0, 0.8, 0, 0])
 

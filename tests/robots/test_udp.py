@@ -39,7 +39,6 @@ from drake_teleop.robots.streams import (
     POSE,
     WRENCH,
     CompensatedWrench,
-    Part,
     Reading,
     ReadingFlag,
 )
@@ -152,16 +151,21 @@ def test_udp_round_trip_accepts_only_this_machine() -> None:
 
 
 def test_wrench_and_pose_in_a_packet() -> None:
-    wrench = Part(WRENCH, 4, 0.5, np.arange(6.0), int(ReadingFlag.SATURATED))
-    pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
+    wrench = Reading(4, 0.5, np.arange(6.0), int(ReadingFlag.SATURATED), stream=WRENCH)
+    pose = Reading(4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]), stream=POSE)
     source = udp.PosedSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for packet in (udp.pack_parts(wrench, pose), b"x" * udp.POSED_FORMAT.size, b"DTP1"):
+        for packet in (
+            udp.pack_wrench_and_pose(wrench, pose),
+            b"x" * udp.POSED_FORMAT.size,
+            b"DTP1",
+        ):
             sender.sendto(packet, ("127.0.0.1", source.port))
     assert source._socket.getsockname()[0] == "127.0.0.1"
     found = source.read(5.0)
     source.close()
-    assert found is not None and [part[:3] for part in found[:2]] == [wrench[:3], pose[:3]]
+    assert found is not None and [part[:2] for part in found[:2]] == [wrench[:2], pose[:2]]
+    assert [part.stream for part in found] == [WRENCH, POSE, WRENCH, WRENCH]
     np.testing.assert_array_equal(found[0].values, -wrench.values)
     np.testing.assert_array_equal(found[1].values, pose.values)
     assert [part.flags for part in found] == [

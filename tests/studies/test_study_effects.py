@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     PARETO_MEASURES,
+    effect_half_widths_over_seeds,
     effects_table,
-    estimate_means,
     is_on_pareto_front,
+    means_and_half_widths_over_seeds,
     pareto_table,
 )
 from drake_teleop.lab.studies.pictures import write_pictures
@@ -46,26 +47,25 @@ def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
 
 def test_intervals_have_their_coverage():
     """95 % of 2000 studies with 5 seeds contain true mean and true effect."""
-    noise, levels = np.random.default_rng(1), np.tile([0, 1, 2], 5)
-    seeds, truth = np.repeat(np.arange(5.0), 3), np.array([1.0, 2.0, 6.0])
+    noise, truth = np.random.default_rng(1), np.array([1.0, 2.0, 6.0])
     inside, effect_inside, widths = [], [], []
     for _ in range(2000):
-        values = truth[levels] + np.repeat(noise.normal(0, 3.0, 5), 3) + noise.normal(0, 0.5, 15)
-        found = estimate_means(values, levels, seeds, 3)
-        inside.append(np.abs(found.mean - truth) <= found.half_width)
-        effect = found.mean - found.mean.mean() - (truth - truth.mean())
-        effect_inside.append(np.abs(effect) <= found.effect_half_width)
-        widths.append(found.effect_half_width / found.half_width)
+        values = truth[:, None] + noise.normal(0, 3.0, 5) + noise.normal(0, 0.5, (5, 3)).T
+        mean, half = means_and_half_widths_over_seeds(values)
+        inside.append(np.abs(mean - truth) <= half)
+        effect, effect_half = mean - mean.mean(), effect_half_widths_over_seeds(values)
+        effect_inside.append(np.abs(effect - (truth - truth.mean())) <= effect_half)
+        widths.append(effect_half / half)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert np.mean(effect_inside) == pytest.approx(0.95, abs=0.01)
     assert np.median(widths) < 0.3  # common shifts of a seed cancel
 
 
 def test_nan_values_are_ignored():
-    values, levels, seeds = np.array([1.0, np.nan, 3.0, 5.0]), np.zeros(4, int), np.arange(4.0)
-    assert estimate_means(values, levels, seeds, 1).mean[0] == 3.0
-    nothing = estimate_means(np.full(4, np.nan), levels, seeds, 1)
-    assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half_width[0])
+    values = np.array([[1.0, np.nan, 3.0, 5.0], [np.nan] * 4])
+    mean, half = means_and_half_widths_over_seeds(values)
+    assert mean[0] == 3.0
+    assert np.isnan(mean[1]) and np.isnan(half[1])
 
 
 def test_effects_equal_the_synthetic_ones():

@@ -6,29 +6,28 @@ H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
 
-RealArray = NDArray[np.float64]
 BooleanArray = NDArray[np.bool_]
 
 _RELATIVE_ROUNDING_ERROR = 1e-12  # relative to the terms that cancel in a criterion
 
 
-def llewellyn_criterion(H: Complex) -> RealArray:
+def llewellyn_criterion(H: Complex) -> Array:
     """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
 
-def llewellyn_parameter(H: Complex) -> RealArray:
+def llewellyn_parameter(H: Complex) -> Array:
     """Return Llewellyn's parameter; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -46,7 +45,7 @@ def is_absolutely_stable(H: Complex) -> BooleanArray:
     )
 
 
-def required_damping(H: Complex) -> RealArray:
+def required_damping(H: Complex) -> Array:
     """Return the additional device damping [N s/m] for absolute stability; inf: impossible."""
     h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
@@ -57,7 +56,7 @@ def required_damping(H: Complex) -> RealArray:
     return np.where(h22.real < 0, np.inf, through) - h11.real
 
 
-def raisbeck_criterion(H: Complex) -> RealArray:
+def raisbeck_criterion(H: Complex) -> Array:
     """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
     h11, h12, h21, h22 = matrix_entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
@@ -74,14 +73,14 @@ def is_passive(H: Complex) -> BooleanArray:
     )
 
 
-def scattering_norm(S: Complex) -> RealArray:
+def scattering_norm(S: Complex) -> Array:
     """Return the largest singular value of a scattering matrix; passive if at most 1."""
     return _largest_singular_value(*matrix_entries(S))
 
 
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
-) -> RealArray:
+) -> Array:
     """Return the structured singular value mu of the scattering matrix S (T56).
 
     `hand`, `environment`: largest reflection factors. With 1 (any passive load), mu <= 1 means
@@ -95,7 +94,7 @@ def structured_singular_value(
     return _largest_singular_value(s11 * r1, turned, even, s22 * r2)
 
 
-def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> RealArray:
+def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> Array:
     determinant = a * d - b * c
     size = np.abs(determinant)
     phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
@@ -105,33 +104,8 @@ def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> R
     return (np.sqrt(sums) + np.sqrt(differences)) / 2
 
 
-def _squared_abs(z: Complex) -> RealArray:
+def _squared_abs(z: Complex) -> Array:
     return z.real**2 + z.imag**2
-
-
-class WorstLoads(NamedTuple):
-    """Reactances X [N s/m] of the lossless hand and environment that are closest to oscillation.
-
-    At w [rad/s], X > 0 is a mass X / w [kg], X < 0 a stiffness -X w [N/m].
-    """
-
-    hand_reactance: RealArray
-    environment_reactance: RealArray
-    loop_resistance: RealArray  #: resistance of the loop; negative: the oscillation grows
-
-
-def worst_loads(H: Complex) -> WorstLoads:
-    """Return the lossless hand and environment closest to oscillation; Re h22 must not be 0."""
-    h11, h12, h21, h22 = matrix_entries(H)
-    product = h12 * h21
-    size = np.abs(product)
-    phase = np.where(size > 0, product / np.where(size > 0, size, 1.0), 1.0)
-    # 1 / (h22 + j B) is on a circle through 0; times h12 h21 its real part is largest here.
-    seen = (1 + np.conj(phase)) / (2 * h22.real)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reactance = -1 / (1 / seen - h22).imag
-    felt = h11 - product * seen
-    return WorstLoads(-felt.imag, reactance, felt.real)
 
 
 @dataclass(frozen=True)
@@ -150,7 +124,7 @@ class ImpedanceRange:
                     f"{low} to {high} is no range", where=name, remedy="give (smallest, largest)"
                 )
 
-    def corners(self, omega: RealArray) -> Complex:
+    def corners(self, omega: Array) -> Complex:
         """Return the range's corners (..., 4) [N s/m] at omega, counter-clockwise."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
@@ -159,7 +133,7 @@ class ImpedanceRange:
             [least + 1j * low, most + 1j * low, most + 1j * high, least + 1j * high], -1
         )
 
-    def contains(self, impedance: Complex, omega: RealArray) -> BooleanArray:
+    def contains(self, impedance: Complex, omega: Array) -> BooleanArray:
         corners = self.corners(omega)
         low, high = corners[..., 0], corners[..., 2]
         return (
@@ -183,28 +157,11 @@ def impedance_range_of_grips() -> ImpedanceRange:
     return ImpedanceRange(mass, damping, stiffness)
 
 
-def can_oscillate(
-    H: Complex, omega: RealArray, hand: ImpedanceRange, environment: ImpedanceRange
-) -> BooleanArray:
-    """Return, for each omega, whether some hand and environment in the ranges oscillate (T57).
+def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
+    """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    If all values on a dense grid are False, all pairs are stable or all are unstable.
+    If all values on a dense grid are infinite, all hands are stable or all are unstable.
     """
-    h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
-    z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
-    dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
-    t, u = _oscillation_points_on_edges(h11, h12 * h21, h22, z, dz, e, de)
-    crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
-    # No edges cross if one region contains the other.
-    felt = transmitted_impedance(H, e[..., 0, 0])
-    z1, h11, h12, h21, h22 = (x[..., 0, 0] for x in (z, h11, h12, h21, h22))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        wanted = 1 / (h12 * h21 / (z1 + h11) - h22)
-    return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
-
-
-def stiffness_limit(H: Complex, omega: RealArray, hand: ImpedanceRange) -> RealArray:
-    """Return, for each omega, the softest wall [N/m] that oscillates with a hand of the range."""
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
@@ -218,7 +175,7 @@ def stiffness_limit(H: Complex, omega: RealArray, hand: ImpedanceRange) -> RealA
 
 def _oscillation_points_on_edges(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
-) -> tuple[RealArray, RealArray]:
+) -> tuple[Array, Array]:
     # Hand z + t dz and wall e + u de oscillate at t, u (nan: never), where
     # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u is zero, so that
     # t = -(a + c u) / (b + d u) is real.
@@ -235,8 +192,8 @@ def _oscillation_points_on_edges(
 
 
 def bounded_singular_value(
-    H: Complex, omega: RealArray, hand: ImpedanceRange, environment: ImpedanceRange
-) -> RealArray:
+    H: Complex, omega: Array, hand: ImpedanceRange, environment: ImpedanceRange
+) -> Array:
     """Return mu; below 1, no hand and environment in the ranges can oscillate at omega [rad/s]."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
@@ -256,7 +213,7 @@ def bounded_singular_value(
 _DISC_CENTRE_OFFSETS_IN_HALF_DIAGONALS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])
 
 
-def _enclosing_discs(corners: Complex) -> tuple[Complex, RealArray]:
+def _enclosing_discs(corners: Complex) -> tuple[Complex, Array]:
     diagonal = corners[..., 2] - corners[..., 0]
     right = (
         diagonal.real[..., None] / 2

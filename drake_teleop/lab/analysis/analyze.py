@@ -10,23 +10,22 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import make_folder, output_folder, write_json
+from drake_teleop.common.files import make_folder, output_folder, to_json_data, write_json
 from drake_teleop.common.numeric import one_blas_thread
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
-from drake_teleop.lab.analysis.linearization import (
-    COMPONENT_NAMES,
-    Linearization,
-    close_network,
-    hybrid_along,
-    linearize,
-)
+from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, Linearization
+from drake_teleop.lab.analysis.linearization import close_network, hybrid_along, linearize
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.report import ReportCurves, print_tables, write_report
+from drake_teleop.lab.analysis.report import (
+    ReportCurves,
+    print_tables,
+    verdict_sentences,
+    write_report,
+)
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
-from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -142,7 +141,7 @@ def _analyze_in_stages(
             linear, along, close_other_directions(free, linear, along)
         )
         measured(1.0)
-    summary = _replace_nonfinite_and_arrays(summary)
+    summary = to_json_data(summary)
     summary["verdict"] = verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
@@ -208,13 +207,3 @@ def close_other_directions(
     return system.close_loop(
         [f"operator_wrench.{axis}" for axis in others], [f"hand_wrench.{axis}" for axis in others]
     )
-
-
-def _replace_nonfinite_and_arrays(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _replace_nonfinite_and_arrays(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_replace_nonfinite_and_arrays(entry) for entry in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _replace_nonfinite_and_arrays(value.tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value

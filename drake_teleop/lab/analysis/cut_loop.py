@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import (
     RECEIVED_FORCE,
     SAMPLED_FORCE,
-    Array,
     Sampling,
     period_map_of_cut_loop,
 )
@@ -28,8 +28,6 @@ _ANGLE_OFFSETS_NEAR_POLES = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.
 _GOLDEN_RATIO, _NUM_GOLDEN_SECTION_STEPS = 0.6180339887498949, 25
 _MAX_GAIN_CROSSINGS = 32
 _MAX_GAIN_OF_NO_LOOP = 1e-9  # largest |L| that counts as no loop
-_MAX_GROWTH_RATE_DOUBLINGS, _NUM_GROWTH_RATE_HALVINGS = 12, 30  # from 1/s
-_NUM_MULTIPLIER_NEWTON_STEPS = 12
 _DISTANCE_OF_MULTIPLIER_FROM_ONE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
@@ -47,19 +45,14 @@ class CutLoop:
 
     @classmethod
     def from_multipliers(
-        cls,
-        open_multipliers: Complex,
-        closed_multipliers: Complex,
-        period_s: ArrayLike,
-        level: ArrayLike = 1.0,
+        cls, open_multipliers: Complex, closed_multipliers: Complex, period_s: ArrayLike
     ) -> CutLoop:
-        """Return the loop with these multipliers (..., n) and the crossings of |L| = `level`."""
+        """Return the loop with these multipliers (..., n) and the crossings of |L| = 1."""
         shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _write_gain_crossings(
             open_multipliers.reshape(-1, n),
             closed_multipliers.reshape(-1, n),
-            np.full(shape, level).ravel(),
             _SEARCH_ANGLES_RAD,
             found.reshape(3, -1, _MAX_GAIN_CROSSINGS),
         )
@@ -135,60 +128,6 @@ def delay_margin(loop: CutLoop) -> Array:
     return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
 
-def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the closed loop's eigenvalue of largest magnitude, with imaginary part >= 0."""
-    shape = np.broadcast_shapes(loop.period_s.shape, np.shape(delay))
-    n = loop.open_multipliers.shape[-1]
-    opened, closed = (
-        np.broadcast_to(m, (*shape, n)) for m in (loop.open_multipliers, loop.closed_multipliers)
-    )
-    period = np.broadcast_to(loop.period_s, shape)
-    delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
-    D = 2 * delay / period
-
-    def rescaled_loop(growth: Array) -> CutLoop:
-        radius = np.exp(growth * period)[..., None]
-        return CutLoop.from_multipliers(
-            opened / radius, closed / radius, period, radius[..., 0] ** D
-        )
-
-    # Bracket the growth rate: `low` has multipliers outside its circle, `high` has none.
-    high, low = np.ones(shape), -np.ones(shape)
-    for _ in range(_MAX_GROWTH_RATE_DOUBLINGS):
-        some = count_unstable_multipliers(rescaled_loop(high), delay) > 0
-        none = count_unstable_multipliers(rescaled_loop(low), delay) == 0
-        if not (some | none).any():
-            break
-        high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
-    for _ in range(_NUM_GROWTH_RATE_HALVINGS):
-        middle = 0.5 * (low + high)
-        some = count_unstable_multipliers(rescaled_loop(middle), delay) > 0
-        low, high = np.where(some, middle, low), np.where(some, high, middle)
-    # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
-    # method starts at the crossings of |L| and at the multipliers without delay.
-    radius = np.exp(high * period)[..., None]
-    crossings = np.where(
-        radius > 0, radius * np.exp(1j * rescaled_loop(high).gain_crossing_angles), 0
-    )
-    z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
-    opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
-    found = np.zeros(z.shape, dtype=bool)
-    with np.errstate(all="ignore"):
-        for _ in range(_NUM_MULTIPLIER_NEWTON_STEPS):
-            to_open, to_closed = z[..., None] - opened, z[..., None] - closed
-            P, M, delay_factor = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
-            slope = P * (1 / to_open).sum(axis=-1) * (1 - delay_factor)
-            slope += (M * (1 / to_closed).sum(axis=-1) + (P - M) * D / z) * delay_factor
-            value = P * (1 - delay_factor) + M * delay_factor
-            step = np.where(value == 0, 0.0, value / slope)
-            # Roots that are found stay: at a root of P or M itself the slope is not valid.
-            z = np.where(found | ~np.isfinite(step), z, z - step)
-            found |= np.abs(step) < 1e-10
-    distance = np.where(found, np.abs(np.abs(z) / radius - 1), np.inf)
-    z = np.take_along_axis(z, distance.argmin(axis=-1)[..., None], axis=-1)[..., 0]
-    return np.where(z.imag < 0, z.conj(), z)
-
-
 @njit(cache=True)
 def _response_at(closed, opened, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
@@ -199,28 +138,26 @@ def _response_at(closed, opened, angle, radius):
 
 
 @njit(cache=True)
-def _write_gain_crossings(opened, closed, levels, angles, found):
+def _write_gain_crossings(opened, closed, angles, found):
     for n in range(opened.shape[0]):
-        poles, zeros, level, count = opened[n], closed[n], levels[n], 0
+        poles, zeros, count = opened[n], closed[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
         value = _response_at(zeros, poles, 0.0, 1.0 + _DISTANCE_OF_MULTIPLIER_FROM_ONE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
-        if size > level:
+        if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _add_gain_extremes(_add_pole_angles(angles, poles), poles, zeros, level)
+        at, values = _add_gain_extremes(_add_pole_angles(angles, poles), poles, zeros)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
             size, phase = abs(value), _unwrap_phase(value, last_phase)
-            if (size > level) != (last_size > level) and count < found.shape[2]:
+            if (size > 1.0) != (last_size > 1.0) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    if (abs(_response_at(zeros, poles, middle, 1.0)) > level) == (
-                        last_size > level
-                    ):
+                    if (abs(_response_at(zeros, poles, middle, 1.0)) > 1.0) == (last_size > 1.0):
                         low = middle
                     else:
                         high = middle
@@ -229,7 +166,7 @@ def _write_gain_crossings(opened, closed, levels, angles, found):
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
-        if size > level and count < found.shape[2]:
+        if size > 1.0 and count < found.shape[2]:
             found[0, n, count], found[2, n, count] = math.pi, 1.0
             found[1, n, count] = math.pi * np.rint(phase / math.pi)
 
@@ -248,7 +185,7 @@ def _add_pole_angles(angles, poles):
 
 
 @njit(cache=True)
-def _add_gain_extremes(angles, poles, zeros, level):
+def _add_gain_extremes(angles, poles, zeros):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _response_at(zeros, poles, angles[i], 1.0)
@@ -256,16 +193,14 @@ def _add_gain_extremes(angles, poles, zeros, level):
     more = np.empty(angles.shape[0])
     count = 0
     for i in range(1, angles.shape[0] - 1):
-        sign = 1.0 if size[i] <= level else -1.0
+        sign = 1.0 if size[i] <= 1.0 else -1.0
         is_extreme = sign * size[i] >= max(sign * size[i - 1], sign * size[i + 1])
-        if is_extreme and 0.5 * level < size[i] < 2.0 * level:
+        if is_extreme and 0.5 < size[i] < 2.0:
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_NUM_GOLDEN_SECTION_STEPS):
                 a, b = (high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low))
-                at_a, at_b = (
-                    _response_at(zeros, poles, a, 1.0),
-                    _response_at(zeros, poles, b, 1.0),
-                )
+                at_a = _response_at(zeros, poles, a, 1.0)
+                at_b = _response_at(zeros, poles, b, 1.0)
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:

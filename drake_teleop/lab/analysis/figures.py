@@ -6,23 +6,23 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage
 from drake_teleop.lab.analysis import absolute_stability, sampled_wall, transparency
 from drake_teleop.lab.analysis.cut_loop import (
     count_unstable_multipliers,
     cut_loop,
     delay_margin,
-    dominant_multiplier,
     gain_and_phase_margin,
     loop_response,
 )
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
-from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
+from drake_teleop.lab.analysis.linear_model import MAX_STATES, Linearization
+from drake_teleop.lab.analysis.linearization import hybrid_along
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.lab.analysis.two_port import (
     hybrid_matrix,
@@ -36,7 +36,6 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.scenario import Scenario, replace
 
-Array = NDArray[np.float64]
 #: N/m, walls of the table of margins, in addition to the scenario's own.
 WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
 COMPARISON_BAND_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
@@ -58,29 +57,25 @@ def summarise_diagram_stability(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
     """Return stability and slowest motion of linearised Diagram and one-axis model."""
-    lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
-    loop = cut_loop(axis, sampling)
-    one_axis = _decay_and_frequency(
-        complex(dominant_multiplier(loop, axis.delay)), float(loop.period_s)
-    )
-    figures: dict[str, Any] = {
-        "point": name,
-        "states": len(system.A) + lines,
-        "stable": one_axis["stable"],
-        "decay_1_per_s": None,
-        "frequency_Hz": None,
-        "one_axis": one_axis,
-    }
-    if figures["states"] <= MAX_STATES:
-        figures |= _decay_and_frequency(system.multipliers[0], system.dt)
-    return figures
-
-
-def _decay_and_frequency(multiplier: complex, period: float) -> dict[str, Any]:
+    stable = bool(count_unstable_multipliers(cut_loop(axis, sampling), axis.delay) == 0)
     return {
-        "stable": bool(abs(multiplier) < 1),
-        "decay_1_per_s": float(-np.log(abs(multiplier)) / period),
-        "frequency_Hz": float(abs(np.angle(multiplier)) / period / (2 * np.pi)),
+        "point": name,
+        "states": system.num_states,
+        **_slowest_motion(system, stable),
+        # The count of unstable multipliers also includes those far from the unit circle.
+        "one_axis": _slowest_motion(closed_axis_model(axis, sampling), stable) | {"stable": stable},
+    }
+
+
+def _slowest_motion(system: Linearization, stable: bool) -> dict[str, Any]:
+    # `stable` replaces the multipliers of a model with too many states.
+    if system.num_states > MAX_STATES:
+        return {"stable": stable, "decay_1_per_s": None, "frequency_Hz": None}
+    multiplier = complex(system.multipliers[0])
+    return {
+        "stable": abs(multiplier) < 1,
+        "decay_1_per_s": float(-np.log(abs(multiplier)) / system.dt),
+        "frequency_Hz": float(abs(np.angle(multiplier)) / system.dt / (2 * np.pi)),
     }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
@@ -18,8 +19,6 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import jacobian
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
-
-Array = NDArray[np.float64]
 
 _NUM_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
 _MASS_FIT_BAND_RAD_S = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass

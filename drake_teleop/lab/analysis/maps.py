@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.cut_loop import (
     CutLoop,
     count_unstable_multipliers,
@@ -24,8 +25,6 @@ from drake_teleop.lab.analysis.one_axis import (
 )
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.transparency import ideal_impedance
-
-Array = NDArray[np.float64]
 
 #: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE_NAME = "rate"

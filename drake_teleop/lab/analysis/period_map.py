@@ -13,14 +13,15 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import matrix_balance, schur
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.analysis.linear_model import Linearization
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
+from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
-Array = NDArray[np.float64]
 (MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
@@ -82,36 +83,50 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     return M
 
 
+def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
+    """Return the model with its loop cut at the received force, without delay."""
+    M = period_map_of_cut_loop(axis, sampling)
+    n = M.shape[-1] - 3
+    return Linearization(
+        M[:n, :n],
+        M[:n, n:],
+        np.eye(n)[[MASTER_V, SLAVE_V, SAMPLED_FORCE]],
+        np.zeros((3, 3)),
+        1 / sampling.hand_hz,
+        tuple(f"one axis [{k}]" for k in range(n)),
+        ("hand_force", "environment_force", "received_force"),
+        ("master_velocity", "slave_velocity", "displayed_force"),
+    )
+
+
+def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
+    """Return the model with its loop closed over the delay of both ways."""
+    periods = 2 * delay_in_hand_periods(axis, sampling)
+    return cut_axis_model(axis, sampling).close_loop(
+        ["displayed_force"], ["received_force"], periods
+    )
+
+
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
     """Return the two-port H (N, 2, 2) of the sampled station without hand and wall.
 
     `frequency` (N,) [rad/s]: positive, below half the hand's rate.
     """
-    bare = replace(
-        axis,
-        hand_mass=0.0,
-        hand_damping=0.0,
-        hand_stiffness=0.0,
-        wall_stiffness=0.0,
-        wall_damping=0.0,
-    )
-    M = period_map_of_cut_loop(bare, sampling)
-    n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
+    bare = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
+    bare = replace(bare, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0)
+    model = cut_axis_model(bare, sampling)
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
-    z = np.exp(1j * w * period)
-    delay_factor = z ** -delay_in_hand_periods(axis, sampling)
+    delay_factor = np.exp(-1j * w * model.dt * delay_in_hand_periods(axis, sampling))
     # Responses without delay to a force on the device, and to one of the environment.
-    C = np.eye(n)[[MASTER_V, SLAVE_V, SAMPLED_FORCE]]
-    response = _transfer_matrix(M[:n, :n], M[:n, n : n + 2], C, z)
+    response = model.frequency_response(w)[:, :, :2]
     (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
-    hold = -np.expm1(-1j * w * period) / (1j * w * period)
-    H = np.array(
-        [
-            [hold * (1 + delay_factor**2 * felt) / v_m, delay_factor * felt_e],
-            [-delay_factor * v_s / v_m, -give / hold],
-        ]
+    hold = -np.expm1(-1j * w * model.dt) / (1j * w * model.dt)
+    return two_port_matrix(
+        hold * (1 + delay_factor**2 * felt) / v_m,
+        delay_factor * felt_e,
+        -delay_factor * v_s / v_m,
+        -give / hold,
     )
-    return np.moveaxis(H, 2, 0)
 
 
 def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
@@ -158,7 +173,7 @@ class _PeriodMapRows:
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
-        x, v, push = _mass_spring_motion(0.0, axis.device_damping / mass, period)
+        x, v, push = mass_spring_motion(0.0, axis.device_damping / mass, period)
         hand_force = {
             MASTER_X: -axis.hand_stiffness / mass,
             MASTER_V: -axis.hand_damping / mass,
@@ -199,7 +214,7 @@ class _PeriodMapRows:
     def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
-        x, v, push = _mass_spring_motion(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
+        x, v, push = mass_spring_motion(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
         rows = []
         for i in range(2):
             p = push[..., i]
@@ -216,8 +231,10 @@ class _PeriodMapRows:
         return np.stack(rows, axis=-2)
 
 
-def _mass_spring_motion(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    # (x, x') after `time` of x'' = u - b x' - k x, from x = 1, from x' = 1, and for u = 1.
+def mass_spring_motion(
+    stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """Return (x, x') after `time` of x'' = u - b x' - k x, from x = 1, x' = 1, and for u = 1."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
@@ -235,15 +252,3 @@ def _matrix_exponential(M: Array) -> Array:
     for _ in range(halvings):
         E = E @ E
     return E
-
-
-def _transfer_matrix(A: Array, B: Array, C: Array, z: Complex) -> Complex:
-    # C (z I - A)^-1 B, (N, p, m).
-    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    T, Q = schur(balanced, output="complex")
-    right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q
-    states = np.empty((len(T), len(z), right.shape[1]), complex)
-    for i in reversed(range(len(T))):
-        known = right[i] + np.tensordot(T[i, i + 1 :], states[i + 1 :], 1)
-        states[i] = known / (z - T[i, i])[:, None]
-    return np.moveaxis(np.tensordot(left, states, 1), 1, 0)

@@ -9,12 +9,12 @@ responds with the held force
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
-
-Array = NDArray[np.float64]
+from drake_teleop.lab.analysis.period_map import mass_spring_motion
 
 _NUM_STIFFNESS_BISECTIONS = 60
 
@@ -38,15 +38,14 @@ def stable_stiffness(
 
     Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
-    _, held = _sampled_device_matrices(mass, damping, hand_stiffness, period)
+    device = mass, damping, hand_stiffness
+    push = _sampled_device_motion(*device, period)[2]
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
-    high = 5 / held[..., 0] + np.abs(wall_damping) / period
+    high = 5 / push[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
     for _ in range(_NUM_STIFFNESS_BISECTIONS):
         middle = (low + high) / 2
-        poles = sampled_poles(
-            mass, damping, middle, wall_damping, period, hand_stiffness=hand_stiffness
-        )
+        poles = sampled_poles(*device, middle, wall_damping, period)
         stable = np.abs(poles).max(axis=-1) < 1
         low, high = np.where(stable, middle, low), np.where(stable, high, middle)
     return low
@@ -55,46 +54,38 @@ def stable_stiffness(
 def sampled_poles(
     mass: ArrayLike,
     damping: ArrayLike,
-    stiffness: ArrayLike,
+    hand_stiffness: ArrayLike,
+    wall_stiffness: ArrayLike,
     wall_damping: ArrayLike,
     period: float,
-    *,
-    hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Return the closed loop's eigenvalues (..., 3) over a sample; `stiffness`: wall [N/m]."""
-    mass, damping, K, B, hand = np.broadcast_arrays(
-        mass, damping, stiffness, wall_damping, hand_stiffness
-    )
-    state, held = _sampled_device_matrices(mass, damping, hand, period)
+    """Return the closed loop's eigenvalues (..., 3) over a sample."""
+    K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
+    x, v, push = _sampled_device_motion(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position
     force = np.stack([K + B / period, np.zeros_like(B, dtype=float), -B / period], axis=-1)
-    step = np.zeros((*mass.shape, 3, 3))
-    step[..., :2, :2] = state
-    step[..., :2, :] -= held[..., :, None] * force[..., None, :]
-    step[..., 2, 0] = 1
+    held = push[..., :, None] * force[..., None, :]
+    step = np.zeros((*held.shape[:-2], 3, 3))
+    step[..., :2, 0], step[..., :2, 1], step[..., 2, 0] = x, v, 1
+    step[..., :2, :] -= held
     return np.linalg.eigvals(step).astype(complex)
 
 
-def _sampled_device_matrices(
+def _sampled_device_motion(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
-) -> tuple[Array, Array]:
-    from scipy.linalg import expm
-
-    _check_positive(mass, "mass of the device")
-    _check_positive(damping, "damping of the device")
+) -> tuple[Array, Array, Array]:
+    m = _check_positive(mass, "mass of the device")
+    b = _check_positive(damping, "damping of the device")
+    k = np.asarray(stiffness)
     _check_positive(period, "period")
-    m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
         raise DrakeTeleopError(
             "the stiffness of the hand is negative",
             where="hand_stiffness",
             remedy="give 0 or more [N/m]",
         )
-    rates = np.zeros((*m.shape, 3, 3))
-    rates[..., 0, 1] = 1
-    rates[..., 1, 0], rates[..., 1, 1], rates[..., 1, 2] = -k / m, -b / m, 1 / m
-    motion = expm(rates * period)
-    return motion[..., :2, :2], motion[..., :2, 2]
+    x, v, push = mass_spring_motion(k / m, b / m, period)
+    return x, v, push / m[..., None]
 
 
 def _check_positive(value: ArrayLike, what: str) -> Array:

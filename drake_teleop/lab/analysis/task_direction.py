@@ -9,13 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import finite_array
+from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.station.environment.point_contact import PAIR_STIFFNESS_COLUMN
 from drake_teleop.station.environment.solids import Wall
@@ -25,8 +24,6 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_f
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, SlavePlant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, device_impedance
 from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
-
-RealArray = NDArray[np.float64]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
@@ -26,12 +24,12 @@ def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Comple
 class ApparentImpedance(NamedTuple):
     """Displayed impedance as mass, damping and stiffness."""
 
-    mass: NDArray[np.float64]  #: kg
-    damping: NDArray[np.float64]  #: N s/m
-    stiffness: NDArray[np.float64]  #: N/m
+    mass: Array  #: kg
+    damping: Array  #: N s/m
+    stiffness: Array  #: N/m
 
 
-def fit_apparent_impedance(felt: Complex, omega: RealArray) -> ApparentImpedance:
+def fit_apparent_impedance(felt: Complex, omega: Array) -> ApparentImpedance:
     """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = felt.imag.reshape(len(omega), -1)
@@ -49,7 +47,7 @@ class ZWidth(NamedTuple):
     rigid: Complex
 
     @property
-    def decades(self) -> RealArray:
+    def decades(self) -> Array:
         """Dynamic range log10(|rigid| / |free|)."""
         return np.log10(np.abs(self.rigid) / np.abs(self.free))
 
@@ -72,27 +70,15 @@ def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
-def smallest_stiffness_change(
-    H: Complex,
-    omega: RealArray,
-    stiffness: ArrayLike,
-    weber: float = WEBER_FRACTION,
-    damping: ArrayLike = 0.0,
-) -> RealArray:
-    """Return the smallest stiffness increase [N/m] that a human detects, or inf."""
-    if weber <= 0:
-        raise DrakeTeleopError(
-            f"the Weber fraction is {weber:g}, must be positive",
-            where="weber",
-            remedy="give a fraction, such as 0.23",
-        )
+def smallest_stiffness_change(H: Complex, omega: Array, stiffness: ArrayLike) -> Array:
+    """Return the smallest increase [N/m] of a wall's stiffness that a human detects, or inf."""
     _, h12, h21, h22 = matrix_entries(H)
     s = 1j * omega
-    environment = np.asarray(damping) + np.asarray(stiffness) / s
+    environment = np.asarray(stiffness) / s
     # |Z_to(Z_e + x / s) - Z_to(Z_e)| = |h12 h21 x / s| / |a (a + b x)| with a = 1 + h22 Z_e and
     # b = h22 / s: at the threshold a quadratic in the increase x.
     a, b = 1 + h22 * environment, h22 / s
-    share = weber * np.abs(transmitted_impedance(H, environment) * a * s)
+    share = WEBER_FRACTION * np.abs(transmitted_impedance(H, environment) * a * s)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (share / np.abs(h12 * h21)) ** 2
         q2 = 1 - share * np.abs(b) ** 2

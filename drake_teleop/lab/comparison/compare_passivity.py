@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.delayed_contact import (
@@ -159,8 +159,8 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
 
 
 def simulate_press(
-    scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
-) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    scenario: Scenario, method: str, network: str, leaf: str, estimate: Array
+) -> tuple[dict[str, Any], dict[str, Array]]:
     """Simulate a press on a sheet spring; return its table row and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
@@ -261,7 +261,7 @@ def _run_station_study(
     seed: int,
     jobs: int,
     stage: StartStage,
-) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
+) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, Array]]]:
     base = base_scenario(scenario, seed)
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.

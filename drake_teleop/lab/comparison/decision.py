@@ -9,11 +9,9 @@ from typing import Any
 from drake_teleop.lab.comparison.one_dof import TIP_DISTANCE_M
 from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_AT_REST_N
 
-VERDICT_UNSTABLE, VERDICT_POSITION_ERROR, VERDICT_CHATTERS = (
-    "unstable",
-    "position error",
-    "chatters",
-)
+VERDICT_UNSTABLE = "unstable"
+VERDICT_POSITION_ERROR = "position error"
+VERDICT_CHATTERS = "chatters"
 VERDICT_LEAKS, VERDICT_HOLDS = "leaks", "holds"
 MAX_POSITION_ERROR_M, MIN_LEAKED_ENERGY_J = 5e-3, 1e-3  #: m; J
 

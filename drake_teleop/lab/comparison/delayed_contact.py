@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
@@ -115,7 +115,7 @@ def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: T
     )
 
 
-def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
     """Return a run's t [s], vertical forces at the master's scale [N] and energy [J]."""
     scaling = scenario.force_scaling
     return {
@@ -126,7 +126,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
     }
 
 
-def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
+def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
@@ -136,7 +136,7 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.
 
 def _slave_heights_and_rotations(
     result: SimulationResult, scenario: Scenario
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     arm = slave_arm(scenario)
     poses = np.empty((len(result.t), 7))
     for pose, state in zip(poses, result["slave_state"], strict=True):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_normal
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.lab.analysis.one_axis import AxisParameters
 from drake_teleop.station.channel import network
@@ -107,15 +108,15 @@ class OneDofRun:
         ACTUAL     integral k_f gamma f_w dx_s   wall's force
     """
 
-    t: NDArray[np.float64]  #: s
-    master_position: NDArray[np.float64]  #: m
-    slave_position: NDArray[np.float64]  #: m
-    command_position: NDArray[np.float64]  #: m, received by the slave
-    hand_force: NDArray[np.float64]  #: N, on the hand
-    wall_force: NDArray[np.float64]  #: N, on the slave
-    channel_energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
-    time_without_packets: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
-    accounts: NDArray[np.float64]  #: (N, 4) J
+    t: Array  #: s
+    master_position: Array  #: m
+    slave_position: Array  #: m
+    command_position: Array  #: m, received by the slave
+    hand_force: Array  #: N, on the hand
+    wall_force: Array  #: N, on the slave
+    channel_energy: Array  #: (N, 2) from hand and slave into the channel [J]
+    time_without_packets: Array  #: (N, 2) time without packets of hand and slave [s]
+    accounts: Array  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
@@ -152,9 +153,9 @@ def run_one_dof(
     *,
     seed: int = 0,
     timeout: float = 0.2,
-    intent: NDArray[np.float64] | None = None,
-    grip: NDArray[np.float64] | None = None,
-    wall: NDArray[np.float64] | None = None,
+    intent: Array | None = None,
+    grip: Array | None = None,
+    wall: Array | None = None,
     delays: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
 ) -> OneDofRun:
     """Simulate one run in one degree of freedom.
@@ -219,7 +220,7 @@ def run_one_dof(
     return OneDofRun(t, master, slave, command, felt, pushed, *rest)
 
 
-def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
+def operator_intent(task: Task = Task()) -> Array:
     """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION_M)
@@ -233,7 +234,7 @@ def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
-def _smooth_ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.float64]:
+def _smooth_ramp(t: Array, start: float, length: float) -> Array:
     u = np.clip((t - start) / length, 0.0, 1.0)
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
@@ -252,14 +253,14 @@ def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMea
 
 def figures_of_traces(
     *,
-    t: NDArray[np.float64],
-    master: NDArray[np.float64],
-    slave: NDArray[np.float64],
-    felt: NDArray[np.float64],
-    pressed: NDArray[np.float64],
-    energy: NDArray[np.float64],
+    t: Array,
+    master: Array,
+    slave: Array,
+    felt: Array,
+    pressed: Array,
+    energy: Array,
     task: Task,
-    turned: NDArray[np.float64] | None = None,
+    turned: Array | None = None,
 ) -> RunMeasures:
     """Return the measures of a run of the task from equidistant arrays (N,).
 
@@ -307,7 +308,7 @@ def covering_damping(model: OneDof, round_trip: float) -> float:
     return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
 
 
-def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
+def _displayed_resistance(model: OneDof, round_trip: float) -> Array:
     s = 1j * _RESISTANCE_FREQUENCIES_RAD_S
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -320,14 +321,14 @@ def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float6
     return np.asarray(felt.real)
 
 
-def _range_about_parabola(x: NDArray[np.float64]) -> float:
+def _range_about_parabola(x: Array) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_samples(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
+def _rise_samples(felt: Array, pressed: Array, steady: float) -> float:
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     PERIOD,
@@ -39,9 +39,7 @@ class ReleaseAndTaps:
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
-    def simulate_hand(
-        intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None
-    ) -> OneDofRun:
+    def simulate_hand(intent: Array, grip: Array | None = None) -> OneDofRun:
         return run_one_dof(
             model,
             PassivityConfig(method=method),
@@ -75,7 +73,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     )
 
 
-def _intended_tap_motion(rate: float, round_trip: float) -> NDArray[np.float64]:
+def _intended_tap_motion(rate: float, round_trip: float) -> Array:
     t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
     moving = (t > 0.0) & (t < _NUM_TAPS / rate)
     x = np.where(moving, -_TAP_AMPLITUDE_ABOUT_WALL_M * np.sin(2 * np.pi * rate * t), 0.0)

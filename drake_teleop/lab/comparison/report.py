@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
-from drake_teleop.common.files import write_picture, write_text
-from drake_teleop.common.html import png_data_url, render_page
-from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
+from drake_teleop.common.html import write_report_page
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.comparison.decision import (
     VERDICT_CHATTERS,
     VERDICT_HOLDS,
@@ -50,7 +49,7 @@ VERDICT_STYLES = {
 _NETWORK_MARKERS = "os^Dv"  # marks of the networks
 _CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center"}
 
-Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
+Traces = Mapping[tuple[str, str], Mapping[str, Array]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
@@ -61,18 +60,15 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "energy": draw_energy(summary, traces),
         "limits": draw_round_trip_limits(summary["one_dof"]),
     }
-    for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
-    page = render_page(
+    write_report_page(
+        out,
         "drake_teleop.lab.comparison",
-        "report.html.j2",
+        pictures,
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
         columns=[heading for _, heading, _, _ in RUN_COLUMNS],
         station=[(row, run_cells(row)) for row in summary["station"]],
         covering=summary["covering"],
-        pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
     )
-    write_text(out / "report.html", page)
 
 
 def run_cells(row: Mapping[str, Any]) -> list[str]:
@@ -162,7 +158,7 @@ def draw_release_and_taps(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    def draw_run(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+    def draw_run(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
@@ -174,7 +170,7 @@ def draw_force_traces(summary: Mapping[str, Any], traces: Traces) -> Figure:
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
     """Draw the energy from hand and environment over time."""
 
-    def draw_run_energy(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+    def draw_run_energy(axes: Any, shown: Mapping[str, Array]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 

@@ -7,9 +7,9 @@ by translation and rotation. MOTOR is from the motor torque minus weight, as a w
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
@@ -24,8 +24,6 @@ from drake_teleop.station.slave.arm import (
     pose_into,
     sensor_motion,
 )
-
-Array = NDArray[np.float64]
 
 _SIGNALS_FOR_ENERGY_BALANCES = ("ports", "slave_state", "joint_torque")
 

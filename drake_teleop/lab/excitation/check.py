@@ -53,10 +53,8 @@ def check_trajectory(
     before, q, after = (
         trajectory.evaluate(t + step)[0] for step in (-_DIFFERENCE_STEP_S, 0.0, _DIFFERENCE_STEP_S)
     )
-    qd, qdd = (
-        (after - before) / (2 * _DIFFERENCE_STEP_S),
-        (after - 2 * q + before) / _DIFFERENCE_STEP_S**2,
-    )
+    qd = (after - before) / (2 * _DIFFERENCE_STEP_S)
+    qdd = (after - 2 * q + before) / _DIFFERENCE_STEP_S**2
     return check_motion(robot, t, q, qd, qdd, progress)
 
 

@@ -270,11 +270,9 @@ class CollisionScene:
 def _min_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     touching = (of_shapes > _NEAR_CONTACT_GAPS_M[0]) & (of_shapes < _NEAR_CONTACT_GAPS_M[1])
-    excess = (
-        (of_shapes - capsules_apart)[touching]
-        if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT
-        else np.zeros(1)
-    )
+    excess = np.zeros(1)
+    if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT:
+        excess = (of_shapes - capsules_apart)[touching]
     free = capsules_apart[of_shapes > MIN_CLEARANCE_M]
     return float(
         min(

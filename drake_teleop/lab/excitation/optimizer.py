@@ -115,24 +115,33 @@ class DesignProblem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        task, n = self.task, len(self.task.home_posture)
-        coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
-        joints = self._basis @ coefficients
-        joints[0] += x[:n]
-        write_link_motions(task.arm_table, *joints, self._motions)
-        write_sensor_motion(self._motions, self._vectors)
-        self._gradients[0] = 0.0
+        joints, g, criterion = self._evaluate_motion(x), self._gradients, self.task.criterion
+        g[0] = 0.0
         s, omega, alpha = self._vectors
-        value, g_V = task.criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        criterion_gradient(
-            task.arm_table, self._motions, joints[1], joints[2], g_V, self._gradients[0]
-        )
+        value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
+        criterion_gradient(self.task.arm_table, self._motions, *joints[1:], g_V, g[0])
+        smooth, largest = self._limit_uses(joints, limit_sharpness, g[1:])
+        return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
+
+    def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
+        """Return q, qd, qdd (3, T, n) of a motion, and write the motions of links and sensor."""
+        n = len(self.task.home_posture)
+        joints: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
+        joints[0] += x[:n]
+        joints[1] /= slowdown
+        joints[2] /= slowdown**2
+        write_link_motions(self.task.arm_table, *joints, self._motions)
+        write_sensor_motion(self._motions, self._vectors)
+        return joints
+
+    def _limit_uses(self, joints: Array, sharpness: float, gradients: Array) -> tuple[Array, float]:
+        """Return smooth uses (7,) and the exact largest one; write the gradients (7, 3, T, n)."""
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
-            task.arm_table, *joints, self._motions, task.limits, limit_sharpness,
-            smooth, largest, self._gradients[1:],
+            self.task.arm_table, *joints, self._motions, self.task.limits, sharpness,
+            smooth, largest, gradients,
         )  # fmt: skip
-        return Evaluation(value, smooth, self._gradients_by_unknowns(), float(largest.max()))
+        return smooth, float(largest.max())
 
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""

@@ -26,13 +26,7 @@ from drake_teleop.lab.excitation.excite import (
     find_best_within_limits,
     sensor_motion,
 )
-from drake_teleop.lab.excitation.limits import (
-    LIMIT_NAMES,
-    criterion_gradient,
-    write_limit_uses,
-    write_link_motions,
-    write_sensor_motion,
-)
+from drake_teleop.lab.excitation.limits import LIMIT_NAMES, criterion_gradient
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
     DesignProblem,
@@ -137,24 +131,19 @@ def design_shortest_motion(
         around = problem.best if worst < _MAX_ERROR_RATIO_OF_VARIED_MOTION else None
         if worst <= 1.0:
             shortest_period = np.inf if best is None else best.excitation.trajectory.period
-            vain_rounds = (
-                0
-                if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period
-                else vain_rounds + 1
-            )
+            vain_rounds += 1
+            if trajectory.period < _MAX_PERIOD_RATIO_OF_PROGRESS * shortest_period:
+                vain_rounds = 0
             if trajectory.period < shortest_period:
                 excitation = assemble_excitation(robot, "period", found, trajectory, uses)
                 best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_ROUNDS_WITHOUT_PROGRESS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
-        new_factor = factor * (reached / modelled)
+        last_factor, factor = factor, factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
-        factor = (
-            _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(new_factor, factor)
-            if worst > 1.0 and k > 0
-            else new_factor
-        )
+        if worst > 1.0 and k > 0:
+            factor = _TOLERANCE_FACTOR_MARGIN_AFTER_MISS * np.maximum(factor, last_factor)
     if best is not None:
         return best
     raise DrakeTeleopError(
@@ -222,43 +211,24 @@ class ShortestMotionProblem(DesignProblem):
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
-        task, n, self._at = self.task, len(self.task.home_posture), x.copy()
+        self._at = x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
-        coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
-        q, qd, qdd = self._basis @ coefficients
-        q, qd, qdd = q + x[:n], qd / T, qdd / T**2
-        write_link_motions(task.arm_table, q, qd, qdd, self._motions)
-        write_sensor_motion(self._motions, self._vectors)
-        g = self._gradients
+        joints, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._largest_error_over_tolerance(
             _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         )
-        criterion_gradient(task.arm_table, self._motions, qd, qdd, g_V, g[1])
-        smooth, largest = np.empty((2, len(LIMIT_NAMES)))
-        write_limit_uses(
-            task.arm_table,
-            q,
-            qd,
-            qdd,
-            self._motions,
-            task.limits,
-            limit_sharpness,
-            smooth,
-            largest,
-            g[2:],
-        )
-        by_log_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
+        criterion_gradient(self.task.arm_table, self._motions, *joints[1:], g_V, g[1])
+        smooth, largest = self._limit_uses(joints, limit_sharpness, g[2:])
+        by_log_period = -(g[:, 1] * joints[1] + 2.0 * g[:, 2] * joints[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
         by_log_period[1] -= 0.25
         by_log_period[0] = 1.0
         g[:, 1] /= T
         g[:, 2] /= T**2
         gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
-        return Evaluation(
-            float(x[-1]), np.append(use, smooth), gradients, max(worst, float(largest.max()))
-        )
+        return Evaluation(float(x[-1]), np.append(use, smooth), gradients, max(worst, largest))
 
     def value(self) -> float:
         """Return the period of the last evaluated point [s]."""

@@ -336,10 +336,8 @@ def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], a
 
 
 def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]:
-    enough_room, enough_space = (
-        min(place.joint_margin, _SUFFICIENT_START_JOINT_MARGIN),
-        min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_EDGE_M),
-    )
+    enough_room = min(place.joint_margin, _SUFFICIENT_START_JOINT_MARGIN)
+    enough_space = min(place.cube_half_m, _SUFFICIENT_CUBE_HALF_EDGE_M)
     return enough_room, enough_space, place.is_set_by_position, place.cube_half_m
 
 

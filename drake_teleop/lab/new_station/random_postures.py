@@ -24,11 +24,9 @@ _MIN_COS_TOOL_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis f
 # units of the reach.
 _SENSOR_RADIUS_RANGE_OVER_REACH, _SENSOR_HEIGHT_RANGE_OVER_REACH = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
-(
-    _PREFERRED_RADIUS_OVER_REACH,
-    _PREFERRED_TOOL_HEIGHT_OVER_REACH,
-    _MIN_PREFERRED_HEIGHT_OVER_REACH,
-) = 0.6, 0.25, -0.4
+_PREFERRED_RADIUS_OVER_REACH = 0.6
+_PREFERRED_TOOL_HEIGHT_OVER_REACH = 0.25
+_MIN_PREFERRED_HEIGHT_OVER_REACH = -0.4
 _MAX_SENSOR_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.files import write_text
-from drake_teleop.common.html import png_data_url, render_page
+from drake_teleop.common.html import write_report_page
 
 # Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETER_FORMATS = (
@@ -24,8 +24,11 @@ _PARAMETER_FORMATS = (
     *(("m c", axis, "g m", 1e3) for axis in "xyz"),
     *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
-
-
+_FIGURE_TITLES = {
+    "fig6": "Fig. 6: scaling and elimination of non-contact forces",
+    "fig7": "Fig. 7: scaling and elimination of non-contact torques",
+    "fig8": "Fig. 8: contact transition",
+}
 _NOT_REPORTED = "not reported"
 # Pairs of verdicts: for an accepted value, for an unaccepted value.
 _VERDICTS_OF_SET_VALUES = ("as set", "not as set")
@@ -187,30 +190,29 @@ def parameter_rows(
 
 
 def write_report(
-    path: Path,
+    out: Path,
+    pictures: Mapping[str, Figure],
     *,
     setup: Mapping[str, str],
     summary: Mapping[str, Any],
-    figures: Sequence[tuple[str, Path, str]],
     parameters: Sequence[ParameterRow],
-    replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures, each a title, a PNG file and a caption."""
+    """Write the figures (fig6 to fig8), and report.html with them and a link to replay.html."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
-    page = render_page(
+    write_report_page(
+        out,
         "drake_teleop.lab.reproduction",
-        "report.html.j2",
+        pictures,
         setup=dict(setup),
         versions={"Python": platform.python_version()}
         | {name: metadata.version(name) for name in names},
         tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(title, png_data_url(png), caption) for title, png, caption in figures],
+        titles=_FIGURE_TITLES,
+        captions=figure_captions(summary),
         parameters=parameters,
         summary=summary,
-        replay=replay,
     )
-    write_text(path, page)
 
 
 def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:

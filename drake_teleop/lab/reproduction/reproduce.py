@@ -11,12 +11,10 @@ from drake_teleop.common.files import (
     make_folder,
     output_folder,
     write_json,
-    write_picture,
     write_table,
     write_text,
 )
 from drake_teleop.common.progress import UpdateProgress, show_progress
-from drake_teleop.common.style import PAGE_DPI
 from drake_teleop.lab.identification import (
     LoadIdentification,
     identification_scenario,
@@ -42,7 +40,6 @@ from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     compare_with_paper,
-    figure_captions,
     parameter_rows,
     values_by_full_name,
     write_report,
@@ -173,28 +170,19 @@ def _write_results(
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
     write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
-    for name, picture in pictures.items():
-        write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
     write_replay(
         out / "replay.html", contact.contact_result, contact.scenario, slow_motion=_REPLAY_SLOWDOWN
     )
     figures = values_by_full_name(summary)
-    captions = figure_captions(figures)
-    titles = {
-        "fig6": "Fig. 6: scaling and elimination of non-contact forces",
-        "fig7": "Fig. 7: scaling and elimination of non-contact torques",
-        "fig8": "Fig. 8: contact transition",
-    }
     write_text(out / "table.md", _markdown_table(compare_with_paper(figures)))
     write_report(
-        out / "report.html",
+        out,
+        pictures,
         setup=_describe_setup(seed, force.scenario, load),
         summary=figures,
-        figures=[(titles[name], out / f"{name}.png", captions[name]) for name in titles],
         parameters=parameter_rows(
             true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
         ),
-        replay="replay.html",
     )
 
 

@@ -53,10 +53,8 @@ class Factorial:
         of points to means over the used combinations of the other factors' levels.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
-        (row, rows), (column, columns) = (
-            self._combination_indices(shown),
-            self._combination_indices(others),
-        )
+        row, rows = self._combination_indices(shown)
+        column, columns = self._combination_indices(others)
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
         is_compared, combinations = largest_complete_block(point >= 0)
@@ -126,22 +124,14 @@ def means_and_half_widths_over_seeds(table: Array) -> tuple[Array, Array]:
     return mean, np.where(count > 1, half, np.nan)
 
 
+def effect_half_widths_over_seeds(table: Array) -> Array:
+    """Return the half widths (n,) of the differences from the mean of all n levels."""
+    # Seeds without some level are excluded: they would shift all other levels.
+    return means_and_half_widths_over_seeds(table - table.mean(axis=0))[1]
+
+
 #: Measures of the Pareto front.
 PARETO_MEASURES = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
-
-
-@dataclass(frozen=True, eq=False)
-class MeanEstimate:
-    """Means over seeds at n levels.
-
-    Attributes:
-        mean, half_width: (n,) mean and half width of its interval.
-        effect_half_width: (n,) half width of the difference from the mean of all n levels.
-    """
-
-    mean: Array
-    half_width: Array
-    effect_half_width: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,23 +180,6 @@ class PairMeans:
     is_fitted: bool
 
 
-def estimate_means(
-    values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
-) -> MeanEstimate:
-    """Return the means over seeds of values (N,) at `count` levels; nan is ignored."""
-    present, seed = np.unique(seeds, return_inverse=True)
-    sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
-    known = np.isfinite(values)
-    np.add.at(sums, (levels[known], seed[known]), values[known])
-    np.add.at(runs, (levels[known], seed[known]), 1.0)
-    with np.errstate(invalid="ignore"):
-        table = sums / runs
-    mean, half = means_and_half_widths_over_seeds(table)
-    # Seeds without some level are excluded: they would shift all other levels.
-    _, effect_half = means_and_half_widths_over_seeds(table - table.mean(axis=0))
-    return MeanEstimate(mean, half, effect_half)
-
-
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
     """Return the main effects by measure, factor and level."""
     import polars as pl
@@ -248,7 +221,7 @@ def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans
 class _MeasureData:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied_factors(study)
-        points, values = _values_by_point_and_seed(rows, measure)
+        values = values_by_seed(rows, measure)
         seen = np.isfinite(values)
         self.runs = seen.sum(axis=1)
         known = self.runs > 0
@@ -257,6 +230,7 @@ class _MeasureData:
             return
         used = np.ix_(known, seen.any(axis=0))
         self.table = fill_missing_values(values[used])
+        points = rows.unique("point", keep="first").sort("point")
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [
             levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)
@@ -325,13 +299,13 @@ class _MeasureData:
         return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
-def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    points = rows.unique("point", keep="first").sort("point")
-    _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
+def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array:
+    """Return the values (n, seeds) of a measure at the n sorted levels of the column `by`."""
+    levels, level = np.unique(rows[by].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
-    table = np.full((points.height, len(seeds)), np.nan)
-    table[point, seed] = measure_values(rows, measure)
-    return points, table
+    table = np.full((len(levels), len(seeds)), np.nan)
+    table[level, seed] = measure_values(rows, measure)
+    return table
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
@@ -342,21 +316,13 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
         return None
     fields = [factor.field for factor in study.factors]
     points = rows.unique("point", keep="first").sort("point").select("point", *fields)
-    order, index = np.unique(rows["point"].to_numpy(), return_inverse=True)
-    seeds, complete = rows["seed"].to_numpy(), np.ones(len(order), dtype=bool)
-    means = []
-    for name in PARETO_MEASURES:
-        values = measure_values(rows, name)
-        complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
-        found = estimate_means(values, index, seeds, len(order))
-        points = points.with_columns(
-            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half_width)
-        )
-        means.append(found.mean)
-    return points.with_columns(
-        pl.Series("complete", complete),
-        pl.Series("front", is_on_pareto_front(np.column_stack(means), complete)),
-    )
+    tables = {name: values_by_seed(rows, name) for name in PARETO_MEASURES}
+    complete = np.all(np.isfinite([*tables.values()]), axis=(0, 2))
+    for name, table in tables.items():
+        mean, half = means_and_half_widths_over_seeds(table)
+        points = points.with_columns(pl.Series(name, mean), pl.Series(f"{name}_half", half))
+    front = is_on_pareto_front(points.select(PARETO_MEASURES).to_numpy(), complete)
+    return points.with_columns(pl.Series("complete", complete), pl.Series("front", front))
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -141,10 +141,8 @@ class LevelModel:
         means = [self.comparable_levels(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
-        coefficients, design = (
-            self.pseudo_inverse @ table.mean(axis=1),
-            self._half_width_over_points(table, num_effects),
-        )
+        coefficients = self.pseudo_inverse @ table.mean(axis=1)
+        design = self._half_width_over_points(table, num_effects)
         effects, halves = [], []
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)

@@ -78,11 +78,9 @@ def run_study(
     identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
-    chunks = (
-        _group_into_chunks(first_rows)
-        if part is None
-        else part.chunks(_group_into_chunks(first_rows))
-    )
+    chunks = _group_into_chunks(first_rows)
+    if part is not None:
+        chunks = part.chunks(chunks)
     total = sum(map(len, chunks)) if part else study.num_points() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
         if merge:

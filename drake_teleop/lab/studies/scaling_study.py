@@ -6,7 +6,6 @@ sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,12 @@ from drake_teleop.common.files import (
 )
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import COLOURS, Picture, plot_style
-from drake_teleop.lab.studies.effects import estimate_means, measure_values
+from drake_teleop.lab.studies.effects import (
+    effect_half_widths_over_seeds,
+    means_and_half_widths_over_seeds,
+    measure_values,
+    values_by_seed,
+)
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 
@@ -67,23 +71,16 @@ class ScaleRating:
 
 
 def scaling_study_command(
-    out: Path,
-    *,
-    jobs: int = -1,
-    cluster: str | None = None,
-    repeats: int | None = None,
-    yes: bool | Callable[[str], bool] = False,
-    quiet: bool = False,
-    progress: bool = True,
+    out: Path, *, quiet: bool = False, progress: bool = True, **options: Any
 ) -> dict[str, Any]:
-    """Run the missing runs of the scaling studies; write results; return answer.json's content."""
+    """Run the missing runs of the scaling studies; write results; return answer.json's content.
+
+    The other options are those of `study_command`.
+    """
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
-        study_command(
-            name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
-            progress=progress, yes=yes,
-        )  # fmt: skip
+        study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     sigmas, gammas = _sigmas_and_gammas()
@@ -212,15 +209,13 @@ def _merit_table(
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_FIELD].unique().to_list())
-    levels = np.array([etas.index(value) for value in rows[_ETA_FIELD]])
-    seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
-        for index, row in enumerate(table):
-            figures = (found.mean[index], found.half_width[index], found.effect_half_width[index])
-            names = (measure, f"{measure}_half", f"{measure}_effect_half")
-            row |= {n: v if np.isfinite(v) else None for n, v in zip(names, figures, strict=True)}
+        values = values_by_seed(rows, measure, by=_ETA_FIELD)
+        figures = *means_and_half_widths_over_seeds(values), effect_half_widths_over_seeds(values)
+        names = (measure, f"{measure}_half", f"{measure}_effect_half")
+        for row, at_eta in zip(table, np.column_stack(figures), strict=True):
+            row |= {n: v if np.isfinite(v) else None for n, v in zip(names, at_eta, strict=True)}
     return table
 
 
@@ -233,14 +228,10 @@ def draw_criteria(
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]
-            levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
             for axes, measure in zip(line, CRITERIA.values(), strict=True):
-                found = estimate_means(
-                    measure_values(table, measure), levels, seeds, levels.max() + 1
-                )
-                means, bars = (
-                    a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half_width)
-                )
+                values = values_by_seed(table, measure)
+                means = means_and_half_widths_over_seeds(values)[0].reshape(-1, len(gammas))
+                bars = effect_half_widths_over_seeds(values).reshape(means.shape)
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
                         sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],

@@ -163,11 +163,9 @@ class GuidedExperiment:
             self._live.pace.restart(now)
 
     def time_to_next_tick(self, now: float) -> float:
-        return (
-            self._live.time_to_next_tick(now)
-            if self._is_interval_running
-            else max(0.0, self._frame_due - now)
-        )
+        if self._is_interval_running:
+            return self._live.time_to_next_tick(now)
+        return max(0.0, self._frame_due - now)
 
     @property
     def stopped(self) -> str:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-_NORMAL_QUANTILE_975 = 1.959964
 _DRAWN_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
@@ -71,7 +70,11 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_DONE_SHARE_QUANTITY: _wilson_interval(len(done), len(rows))}
+        from scipy.stats import binomtest
+
+        share = binomtest(len(done), len(rows))
+        interval = share.proportion_ci(method="wilson")
+        found = {_DONE_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -95,13 +98,6 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
     if share:
         return EstimateWithLimits(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
     return EstimateWithLimits(*(math.exp(v) for v in found))
-
-
-def _wilson_interval(successes: int, n: int) -> EstimateWithLimits:
-    p, z2 = successes / n, _NORMAL_QUANTILE_975**2
-    middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _NORMAL_QUANTILE_975 / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return EstimateWithLimits(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 
 def write_results(experiment: Experiment, store: TrialStore) -> pl.DataFrame:

@@ -263,10 +263,8 @@ class _FunctionTranslation:
                 [self._translate_expression(each) for each in node.args],
             )
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.Not)):
-            value, negative = (
-                self._translate_expression(node.operand),
-                isinstance(node.op, ast.USub),
-            )
+            value = self._translate_expression(node.operand)
+            negative = isinstance(node.op, ast.USub)
             if not isinstance(value, _CScalar):
                 return -value if negative else not value
             kind = value.kind if negative else "int"

@@ -28,6 +28,7 @@ from drake_teleop.common.vectors import (
     cross,
     normalized_quaternion,
     plus,
+    quaternion_at,
     quaternion_product,
     rotate_vector,
     scale_vector,
@@ -112,11 +113,6 @@ def _pose_as_quaternion_and_position(X: RigidTransform) -> Array:
 
 
 @njit(cache=True)
-def _quaternion_at(x, i):
-    return x[i], x[i + 1], x[i + 2], x[i + 3]
-
-
-@njit(cache=True)
 def poses_and_twists_into(joints, state, out):
     """Write pose and twist of m bodies at the plant's state [q; v] into `out` (m, 13).
 
@@ -128,12 +124,12 @@ def poses_and_twists_into(joints, state, out):
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
         if row[_PARENT_ROW_COLUMN] >= 0.0:
             above = out[int(row[_PARENT_ROW_COLUMN])]
-            turn, place = _quaternion_at(above, 0), vector_at(above, 4)
+            turn, place = quaternion_at(above, 0), vector_at(above, 4)
             spin, speed = vector_at(above, 7), vector_at(above, 10)
         # From parent to F.
         lever = rotate_vector(turn, vector_at(row, _X_PF_COLUMN + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = quaternion_product(turn, _quaternion_at(row, _X_PF_COLUMN))
+        turn = quaternion_product(turn, quaternion_at(row, _X_PF_COLUMN))
         # From F to M.
         q, v, kind, axis = (
             int(row[_POSITION_INDEX_COLUMN]),
@@ -158,11 +154,11 @@ def poses_and_twists_into(joints, state, out):
                 plus(speed, cross(spin, lever)), rotate_vector(turn, vector_at(state, v + 3))
             )
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
-            turn = quaternion_product(turn, normalized_quaternion(_quaternion_at(state, q)))
+            turn = quaternion_product(turn, normalized_quaternion(quaternion_at(state, q)))
         # From M to B.
         lever = rotate_vector(turn, vector_at(row, _X_MB_COLUMN + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = quaternion_product(turn, _quaternion_at(row, _X_MB_COLUMN))
+        turn = quaternion_product(turn, quaternion_at(row, _X_MB_COLUMN))
         out[k, 0], out[k, 1], out[k, 2], out[k, 3] = turn
         out[k, 4], out[k, 5], out[k, 6] = place
         out[k, 7], out[k, 8], out[k, 9] = spin
@@ -201,7 +197,7 @@ def interpolate_joint_state(joints, h, u, start, end, out):
                 out[q + 4 + i], out[v + 3 + i] = _interpolate_hermite(
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
-            a, b = _quaternion_at(start, q), _quaternion_at(end, q)
+            a, b = quaternion_at(start, q), quaternion_at(end, q)
             a_dot, b_dot = (
                 _quaternion_rate(vector_at(start, v), a),
                 _quaternion_rate(vector_at(end, v), b),
