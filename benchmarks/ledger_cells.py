@@ -19,6 +19,7 @@ left      slave and hand differ by at most 5 mm, 2 s and two round trips after t
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
 import json
 import math
@@ -43,8 +44,7 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
-from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
-from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT
+from drake_teleop.station.master.data_sheets import FIGURES, Master
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
     MinimumJerk,
@@ -117,9 +117,7 @@ def draw(seed: int, index: int) -> Drawn:
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
     peak = (
-        Master(model=device, figures=data_sheet_in_settings({"model": device}))
-        .device(0.0, 0.0)
-        .peak_force
+        Master(model=device, figures=copy.deepcopy(FIGURES.get(device))).device(0.0, 0.0).peak_force
     )
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
     grips = [name for name, hand in GRIP_IMPEDANCES.items() if force / hand.stiffness < 0.04]
@@ -265,7 +263,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=data_sheet_in_settings({"model": drawn.device})),
+        master=Master(model=drawn.device, figures=copy.deepcopy(FIGURES.get(drawn.device))),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,
@@ -282,7 +280,9 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
-    master.GetSubsystemByName("master_device")._constants[0][HAND_MASS_SLOT] = 0.0
+    device = master.GetSubsystemByName("master_device")
+    parameters, *scratch = device._constants
+    device._constants = (parameters._replace(hand_mass=0.0), *scratch)
     advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_recorded_signals(simulator, SETTLE)
 

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import drake_teleop
@@ -67,7 +68,12 @@ def test_lists_blocks_and_optional_fields() -> None:
 VECTORS = {
     f"{block.__name__}.{entry.name}": (block, entry)
     for block, entry in everything(Scenario)
-    if entry.unit and entry.list_depth == 1
+    if entry.unit and entry.list_depth == 1 and entry.default != []
+}
+LISTS = {
+    f"{block.__name__}.{entry.name}": (block, entry)
+    for block, entry in everything(Scenario)
+    if entry.unit and entry.default in ([], {})
 }
 
 
@@ -79,6 +85,17 @@ def test_vector_of_another_length_raises(place: str, surplus: int) -> None:
     value = [max(entry.low, 0.0)] * (entry.length + surplus)
     with pytest.raises(DrakeTeleopError, match=rf"{entry.name}: .*{len(value)} number"):
         check_ranges(block(**{entry.name: value}), "scenario")
+
+
+@pytest.mark.parametrize("place", sorted(LISTS))
+def test_each_number_of_a_list_or_mapping_is_in_its_range(place: str) -> None:
+    block, entry = LISTS[place]
+    name = f"{entry.name}.j" if entry.is_mapping else entry.name
+    for wrong in (np.nextafter(entry.low, -np.inf), np.nan):
+        values = [entry.low, wrong]
+        given = dict(zip("ij", values, strict=True)) if entry.is_mapping else values
+        with pytest.raises(DrakeTeleopError, match=rf"{block.__name__}\.{name}: .* is outside"):
+            block(**{entry.name: given})
 
 
 def test_instance_gives_its_own_defaults() -> None:

@@ -103,6 +103,14 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
     "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),
+    "a log": (lambda: dt.identify_log({"wrench": 1}), "log"),  # type: ignore[arg-type]
+    "a cut-off": (lambda: dt.identify_log("log.csv", cutoff_hz="30"), "cutoff_hz"),  # type: ignore[arg-type]
+    "its size": (lambda: dt.eliminate_log("log.csv", "load.json", cutoff_hz=-3.0), "cutoff_hz"),
+    "a time span": (lambda: eliminated(untouched_s=3.0), "untouched_s"),
+    "words in it": (lambda: eliminated(untouched_s=("a", "b")), "untouched_s"),
+    "a start": (lambda: eliminated(causal="delayed", causal_tare_s="1"), "causal_tare_s"),
+    "a numeral for a scale": (lambda: scaled(gamma="1"), "gamma"),
+    "dates": (lambda: dt.regressor(N3.astype("M8[s]"), N3, N3), "s"),  # type: ignore[arg-type]
     "a method": (lambda: dt.identify_log("log.csv", method=7), "method"),  # type: ignore[arg-type]
     "a load's file": (lambda: dt.eliminate_log("log.csv", 7), "load"),  # type: ignore[arg-type]
     "Identification": (lambda: dt.Identification.load(7), "load"),  # type: ignore[arg-type]
@@ -113,6 +121,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 
 def station(**arguments: Any) -> Any:
     return dt.MakeTeleopStation(dt.Scenario(), **arguments)
+
+
+def eliminated(**arguments: Any) -> Any:
+    return dt.eliminate_log("log.csv", "load.json", **arguments)
 
 
 def identified(trajectory: Any) -> Any:

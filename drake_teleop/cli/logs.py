@@ -138,11 +138,6 @@ def eliminate_command(
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
     }
-    if found.point_mass_inertias:
-        summary["notes"].append(
-            f"{', '.join(found.point_mass_inertias)} of the load file are not identifiable: those"
-            " of a point mass are used"
-        )
     if found.tare_fraction < 0.5:
         summary["notes"].append(
             "less than half of the record agrees on the sensor's offsets: if it is in contact most"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import numbers
+import os
 import reprlib
 import types
 import typing
@@ -13,10 +14,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from inspect import cleandoc
+from pathlib import Path
 from textwrap import TextWrapper
 from typing import Any, NamedTuple, TypeVar
 
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
+from drake_teleop.common.files import models_dir
 from drake_teleop.common.registry import Registry
 
 TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
@@ -27,15 +30,21 @@ _assignment_checks_enabled = ContextVar("checks_assignments", default=True)
 def quantity(
     default: Any, unit: str, low: float, high: float, doc: str, *, length: int | None = None
 ) -> Any:
-    """Return a dataclass field for a number or, with a list as default, a vector.
+    """Return a dataclass field for a number or, with a list or mapping as default, several.
 
     `unit` is an SI unit, "1" if dimensionless; `low` and `high` limit the plausible range.
-    `length` is that of a vector whose default is None.
+    `length` is that of a vector whose default is None. A list that is empty by default has any
+    length.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
-    if isinstance(default, list):
+    if isinstance(default, list) and default:
         metadata["length"] = len(default)
-        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
+    return _field_with_default(default, metadata)
+
+
+def _field_with_default(default: Any, metadata: dict[str, Any]) -> Any:
+    if isinstance(default, (list, dict)):
+        return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -47,12 +56,39 @@ def choice(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
-    """Return a dataclass field for a flag, word, integer, list or mapping of names."""
-    metadata = {"doc": doc, "registry": registry}
-    if isinstance(default, (list, dict)):
-        return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+def plain(
+    default: Any, doc: str, registry: Registry[Any] | None = None, *, is_path: bool = False
+) -> Any:
+    """Return a dataclass field for a flag, word, integer, list or mapping of names.
+
+    With `is_path`, the field has one path or several, see `with_absolute_paths`.
+    """
+    return _field_with_default(default, {"doc": doc, "registry": registry, "is_path": is_path})
+
+
+def with_absolute_paths(config: Any, folder: Path) -> Any:
+    """Return a copy with absolute paths, also in inner blocks; relative ones begin in `folder`.
+
+    Names of shipped models remain, unless `folder` contains such a file.
+    """
+
+    def resolve(value: Any, is_path: bool) -> Any:
+        if isinstance(value, list):
+            return [resolve(item, is_path) for item in value]
+        if dataclasses.is_dataclass(value):
+            return with_absolute_paths(value, folder)
+        if not is_path or not value:
+            return value
+        path = (folder / value).resolve()
+        is_shipped = not os.path.exists(path) and os.path.isfile(models_dir() / value)
+        return value if is_shipped else str(path)
+
+    changes = {}
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if (resolved := resolve(value, entry.metadata.get("is_path", False))) != value:
+            changes[entry.name] = resolved
+    return dataclasses.replace(config, **changes) if changes else config
 
 
 def short_text(value: Any) -> str:
@@ -125,6 +161,10 @@ def _check_field_value(field: Any, kind: FieldType, value: Any, place: str) -> N
 
 
 def _check_quantity_range(metadata: Any, value: Any, place: str) -> None:
+    if isinstance(value, dict):
+        for name, number in value.items():
+            _check_quantity_range(metadata, number, f"{place}.{name}")
+        return
     values = value if isinstance(value, list) else [value]
     length = metadata.get("length")
     if length is not None and len(values) != length:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from contextlib import AbstractContextManager
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 
 Array: TypeAlias = NDArray[np.float64]
+_Record = TypeVar("_Record", bound=Any)
 
 
 def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
@@ -36,10 +37,18 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
+        if np.asarray(value).dtype.kind in "mM":
+            raise ValueError("dates or time spans")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         what = f"holds no numbers ({error})"
         raise DrakeTeleopError(what, where=name, remedy=remedy) from error
+
+
+def as_compiled_arguments(values: _Record) -> _Record:
+    """Return a named tuple with each number as a float and each vector as a float64 array."""
+    numbers = (np.array(value, float) if np.ndim(value) else float(value) for value in values)
+    return values._make(numbers)
 
 
 def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
@@ -68,6 +77,8 @@ def _broadcast_to_table(table: Array, shape: tuple[int, ...]) -> Array:
 def to_float(name: str, value: Any) -> float:
     """Return `value` as a float, possibly NaN; raise DrakeTeleopError if not numeric."""
     try:
+        if isinstance(value, (str, bytes)):
+            raise TypeError
         return float(
             float_array(name, value) if isinstance(value, (np.generic, np.ndarray)) else value
         )

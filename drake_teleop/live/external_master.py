@@ -27,7 +27,6 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.live.station_swap import finish_master_side
-from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
 from drake_teleop.station.passivity.packet import limit_group
@@ -187,7 +186,7 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
     """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
     parameters = scenario.master.device(0.0, 0.0).parameters
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    limits = np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
+    limits = np.array([parameters.peak_force, parameters.peak_torque.max()])
     builder, inner = DiagramBuilder(), DiagramBuilder()
     scaling = inner.AddNamedSystem(
         "kinematic_scaling",

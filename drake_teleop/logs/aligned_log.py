@@ -126,6 +126,7 @@ class AlignedLog:
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: log with motion by numerical differentiation, if required.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
+        clock_notes: note on the clock rate of the poses, if it is corrected.
     """
 
     log: Log
@@ -133,6 +134,7 @@ class AlignedLog:
     delay_source: str
     log_with_differentiated_motion: Log | None
     edge: NDArray[np.bool_]
+    clock_notes: tuple[str, ...] = ()
 
 
 def read_aligned_log(
@@ -158,13 +160,13 @@ def read_aligned_log(
     if found is not None:
         motion, source = found
         moved, one_sided = use_spline_motion(log, motion)
-        moved = replace(moved, notes=(*moved.notes, *clock_rate_notes(motion)))
         plain = remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
             moved = replace_specific_force_by_acceleration(moved)
             plain = None if plain is None else replace_specific_force_by_acceleration(plain)
         edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
-        smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
+        notes = tuple(clock_rate_notes(motion))
+        smooth = AlignedLog(moved, motion.delay_s, source, plain, edge, notes)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:

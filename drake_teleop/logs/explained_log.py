@@ -14,6 +14,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.identification import Identification, is_precise_enough
+from drake_teleop.logs.causes.candidates import has_negative_mass
 from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record
@@ -304,7 +305,8 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
         return replace(load, covariance=wide, identifiable=known)
     deviations = np.sqrt(np.diag(why.covariance))
     identifiable = is_precise_enough(deviations, why.theta[6:])
-    if why.causes and why.causes[0].name == "no load":
+    no_load = bool(why.causes) and why.causes[0].name == "no load"
+    if no_load or has_negative_mass(why.state):
         identifiable = np.repeat([True, False], [6, 10])
     if why.has_several_gains:
         identifiable = np.zeros(16, bool)

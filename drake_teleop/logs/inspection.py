@@ -111,7 +111,8 @@ def _are_column_names_numbers(names: Sequence[str]) -> bool:
 def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     write_text(path, draft.text())
     summary["draft"] = str(path)
-    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
+    places = ", ".join(_places_to_fill_in(draft.streams))
+    lacking = [f"places that were not recognized: FILL IN {places}"] if places else []
     try:
         load_description(path)
     except DrakeTeleopError as error:
@@ -124,6 +125,16 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
         text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
     write_text(path, text)
+
+
+def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
+    out = []
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            out += _places_to_fill_in(value, f"{outer}{name}.")
+        elif value == "FILL IN" or (isinstance(value, list) and "FILL IN" in value):
+            out.append(f"{outer}{name}")
+    return out
 
 
 def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:

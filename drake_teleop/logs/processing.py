@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, one_blas_thread, to_float
-from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
+from drake_teleop.common.numeric import Array, finite_array, one_blas_thread, to_float
+from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, BatchResult, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import (
     contact_wrench,
@@ -63,13 +63,14 @@ from drake_teleop.logs.read.alignment import (
     remove_delay,
 )
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.reading import MIN_BANDWIDTH_HZ, read_log
 
 _CAUSES_EXPLAINED_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
 _CONSTANT_CHANNEL_TOLERANCE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _MIN_REPORTED_DELAY_OVER_STD = 5.0  # standard deviations
+_MIN_CORRECTED_DELAY_S = 1e-4
 _MAX_FORCE_SCALE = 100.0  # as in `ForceScalingConfig`
 _SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
@@ -114,7 +115,6 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass_inertias: names of undetermined inertias, replaced by those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -132,7 +132,6 @@ class EliminatedLog:
 
     log: Log
     phi: Array
-    point_mass_inertias: tuple[str, ...]
     offsets: Array
     tare_fraction: float
     delay_s: float
@@ -179,9 +178,20 @@ def identify_log(
         DrakeTeleopError: for an unusable log, an unknown method or a worthless result.
     """
     METHODS.check(method, "method")
+    check_log_arguments(path, cutoff_hz)
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
         return _read_and_identify_log(path, method, cutoff_hz, delay, check)
+
+
+def check_log_arguments(path: Any, cutoff_hz: Any) -> None:
+    expect_type((str, Path), path, "log", "give the file's name")
+    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
+        raise DrakeTeleopError(
+            f"{cutoff_hz:g} Hz is too low",
+            where="cutoff_hz",
+            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter",
+        )
 
 
 def _read_and_identify_log(
@@ -199,19 +209,7 @@ def _read_and_identify_log(
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.delay_source
     else:
-        delay_s, source = choose_delay(log, cutoff_hz, delay)
-        log = remove_delay(log, delay_s)
-        log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
-        fit = identify_batch(
-            log.wrench,
-            *log.motion,
-            method=method,
-            shared_noise=log.static,
-            resolution=log.resolution,
-            delay_s=delay_s,
-            gain_std=log.gain_std,
-        )
-    result = fit.identification
+        log, fit, delay_s, source = _fit_load_to_motion(raw, method, cutoff_hz, delay)
     motion = None if posed is None else posed.motion
     why = (
         explain_log(raw, delay_s, motion)
@@ -220,10 +218,18 @@ def _read_and_identify_log(
     )
     if (
         why is not None
-        and log.gain_std > 0.0
+        and raw.gain_std > 0.0
         and {x.name for x in why.causes} <= _CAUSES_EXPLAINED_BY_GAIN_ERRORS
     ):
         why = replace(why, causes=(), explained=True, loads=())
+    is_delay_disturbed = why is not None and abs(why.delay_s) > _MIN_CORRECTED_DELAY_S
+    if why is not None and why.causes and source == "estimated" and is_delay_disturbed:
+        if posed is None:
+            log, fit = _fit_load_to_motion(raw, method, cutoff_hz, delay_s + why.delay_s)[:2]
+        else:
+            posed, other = fit_load_to_posed_log(raw, method, cutoff_hz, delay_s + why.delay_s)
+            log, fit = (log, fit) if posed is None else (posed.log, posed.fit)
+    result = fit.identification
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.is_misfit:
@@ -271,6 +277,24 @@ def _read_and_identify_log(
     )
 
 
+def _fit_load_to_motion(
+    log: Log, method: str, cutoff_hz: float | None, delay: str | float
+) -> tuple[Log, BatchResult, float, str]:
+    delay_s, source = choose_delay(log, cutoff_hz, delay)
+    log = remove_delay(log, delay_s)
+    log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
+    fit = identify_batch(
+        log.wrench,
+        *log.motion,
+        method=method,
+        shared_noise=log.static,
+        resolution=log.resolution,
+        delay_s=delay_s,
+        gain_std=log.gain_std,
+    )
+    return log, fit, delay_s, source
+
+
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_CHANNEL_TOLERANCE * np.maximum(high, -low)).any():
@@ -287,8 +311,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     checks = check_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
-    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
-        return checks
+    except DrakeTeleopError as error:
+        findings = checks.findings or (Finding("payload", str(error)),)
+        return replace(checks, findings=findings)
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
@@ -358,6 +383,12 @@ def eliminate_log(
         DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
             with static poses, or an unknown statistic.
     """
+    check_log_arguments(path, cutoff_hz)
+    if untouched_s is not None:
+        start_s, stop_s = finite_array("untouched_s", untouched_s, 2).tolist()
+        untouched_s = start_s, stop_s
+    if causal_tare_s is not None:
+        causal_tare_s = to_float("causal_tare_s", causal_tare_s)
     identification = load if isinstance(load, Identification) else Identification.load(load)
     separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
     scales = _checked_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
@@ -431,7 +462,7 @@ def _read_and_eliminate_log(
             where="causal_tare_s",
             remedy="give causal as well, or remove it",
         )
-    phi, point_mass = usable_phi(identification)
+    phi, _ = usable_phi(identification)
     phi_object = phi - phi_gripper
     aligned = read_aligned_log(
         path,
@@ -502,10 +533,13 @@ def _read_and_eliminate_log(
             scaled=causal_wrench.scaled[known],
         )
     contact = low_pass_wrench(contact)
+    findings = _find_suspected_errors(Path(path), log.wrench - offsets, contact, identification)
+    notes = (*log.notes, *notes_on_undetermined_load(identification))
+    # A wrong description would explain the clock, too.
+    log = replace(log, notes=notes if findings else (*notes, *aligned.clock_notes))
     return EliminatedLog(
         log=log.select_rows(known),
         phi=phi,
-        point_mass_inertias=point_mass,
         offsets=offsets,
         tare_fraction=fraction,
         delay_s=delay_s,
@@ -518,7 +552,7 @@ def _read_and_eliminate_log(
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
         edge=edge,
-        findings=_find_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
+        findings=findings,
     )
 
 
@@ -554,6 +588,20 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETER_NAMES[10 + i] for i in replaced)
+
+
+def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
+    """Return notes on parameters of a load that are not identified: moments, and inertias."""
+    named = zip(PARAMETER_NAMES[6:10], load.verdicts[6:10], strict=True)
+    moments = [name for name, verdict in named if verdict == "not"]
+    return tuple(
+        f"{', '.join(names)} of the load are not identified: {effect}"
+        for names, effect in (
+            (moments, "their errors are in the contact wrench; identify the load again"),
+            (usable_phi(load)[1], "those of a point mass are used"),
+        )
+        if names
+    )
 
 
 def _find_suspected_errors(

@@ -150,9 +150,11 @@ _MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
 class ReadingStreams(Source):
-    """Source of wrenches and motions, from one or two sources."""
+    """Source of wrenches and motions, from one or two sources; `where` names them."""
 
-    def __init__(self, wrench: Source, motion: Source | None = None) -> None:
+    def __init__(
+        self, wrench: Source, motion: Source | None = None, *, where: str = "the source"
+    ) -> None:
         self._wrench, self._motion = wrench, motion
         self.dt, self.two_clocks = wrench.dt, motion is not None
         streams = (wrench if motion is None else motion).streams
@@ -160,8 +162,9 @@ class ReadingStreams(Source):
         if not self.motion_stream:
             raise DrakeTeleopError(
                 "delivers no motion",
-                where="the source",
-                remedy="give --motion, such as rtde://HOST",
+                where=where,
+                remedy="give --motion, such as rtde://HOST, or for ROS 2 pose=, tf= or imu= in the"
+                " address",
             )
         self.streams = WRENCH, self.motion_stream
 

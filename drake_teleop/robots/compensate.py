@@ -15,6 +15,7 @@ import numpy as np
 from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, handle_sigint
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
@@ -158,6 +159,8 @@ def run_compensate_command(
     wrenches = open_sink(sink)
     control_port = None if control is None else TareRequestPort(control)
     changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
+    for note in notes_on_undetermined_load(found):
+        report(f"warning: {note}")
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     report(f"outputs are {1e3 * late:.1f} ms late")
     report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")

@@ -168,7 +168,7 @@ def _open_streams(
                     remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
                 )
             opened[-1] = PoseSourceFromJoints(opened[-1], arm)
-        return ReadingStreams(*opened)
+        return ReadingStreams(*opened, where=motion or address)
     except BaseException:
         for each in opened:
             each.close()

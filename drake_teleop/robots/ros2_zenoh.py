@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.errors import require_library
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2_messages import (
@@ -46,7 +46,7 @@ def message_types() -> Any:
 
 
 def open_session(address: Address) -> Any:
-    """Return a session with the zenoh router at `address`, which may start later."""
+    """Return a session with the zenoh router at `address`; it reconnects after an interruption."""
     import zenoh
 
     config = zenoh.Config()
@@ -60,7 +60,14 @@ def open_session(address: Address) -> Any:
         "scouting/multicast/enabled": False,
     }.items():
         config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise DrakeTeleopError(
+            f"no zenoh router answers on port {address.port}",
+            where=address.text,
+            remedy="check the host, and start the router: ros2 run rmw_zenoh_cpp rmw_zenohd",
+        ) from error
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:

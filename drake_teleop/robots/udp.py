@@ -99,7 +99,11 @@ def open_udp_receiver(host: str, port: int) -> socket.socket:
         receiver.bind((host, port))
     except OSError as error:
         receiver.close()
-        raise DrakeTeleopError(str(error), where=f"udp://{host}:{port}") from error
+        raise DrakeTeleopError(
+            str(error),
+            where=f"udp://{host}:{port}",
+            remedy="give a free port, and as host nothing or an address of this machine",
+        ) from error
     return receiver
 
 

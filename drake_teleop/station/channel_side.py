@@ -5,20 +5,18 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel.channel import TeleopChannel
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.joint_control import servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
 from drake_teleop.station.wiring import export_outputs
-
-Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
@@ -54,19 +52,14 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             builder.ExportOutput(wire.get_output_port(), exit_)
         return builder.Build()
     scaling = scenario.kinematic_scaling
-    channel = builder.AddNamedSystem(
-        "channel",
-        TeleopChannel(
-            scenario.channel,
-            _adapt_passivity_to_device(scenario, passivity_with_arm_mass(scenario)),
-            RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
-            np.array([scaling.translation_scale, scaling.rotation_scale]),
-            _contact_force_scale(scenario),
-            start_pose(scenario.slave),
-            1 / scenario.rates.hand_hz,
-            scenario.simulation.seed,
-        ),
-    )
+    passivity = _adapt_passivity_to_device(scenario, passivity_with_arm_mass(scenario))
+    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
+    motion_scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    scales = motion_scales, _contact_force_scale(scenario)
+    start, period = start_pose(scenario.slave), 1 / scenario.rates.hand_hz
+    seed = scenario.simulation.seed
+    block = TeleopChannel(scenario.channel, passivity, R_WB, *scales, start, period, seed)
+    channel = builder.AddNamedSystem("channel", block)
     own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
     for name in own:
         builder.ExportInput(channel.GetInputPort(name), name)
@@ -108,12 +101,9 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
-    servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
+    stiffness, damping, mass = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
-        passivity,
-        servo_stiffness=servo.stiffness,
-        servo_damping=servo.damping,
-        slave_mass=servo.mass,
+        passivity, servo_stiffness=stiffness, servo_damping=damping, slave_mass=mass
     )
 
 

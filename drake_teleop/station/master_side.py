@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.master.device import AddHapticDevice
 from drake_teleop.station.master.dynamics import HapticDevice
@@ -107,21 +107,14 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     return builder.Build()
 
 
-def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
+def _make_operator(scenario: Scenario, start_B: Array) -> Operator:
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
     forward, backward = (mean_delay(line) for line in scenario.channel.networks_of_directions())
-    training = OperatorTraining(
-        RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
-        scaling.translation_scale,
-        forces.scales().gamma * forces.force_scale,
-        forward,
-        backward,
-        scenario.simulation.seed,
-    )
+    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
+    gains = scaling.translation_scale, forces.scales().gamma * forces.force_scale
+    training = OperatorTraining(R_WB, *gains, forward, backward, scenario.simulation.seed)
     slave = NominalSlave(scenario.slave)
-    tip_W = slave.start_tip
-    return Operator(
-        scenario.operator, start_B, training, slave.arm, np.concatenate([slave.tip, tip_W])
-    )
+    tip = np.concatenate([slave.tip, slave.start_tip])
+    return Operator(scenario.operator, start_B, training, slave.arm, tip)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array
+
 Flags = NDArray[np.bool_]
 
 # Smallest reported amplitude of a pose: position [m] and orientation [rad].

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -18,10 +17,9 @@ from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBo
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir, output_folder, write_json
-from drake_teleop.common.numeric import contact_spans
+from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
-from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.replay_file import (
     Canvas,
@@ -45,7 +43,6 @@ from drake_teleop.station.slave.surroundings import (
     joint_positions_of_pose,
 )
 
-Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
 
 _TABLE_HEIGHT_M = 0.60
@@ -107,11 +104,9 @@ def write_replay(
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
-        raise DrakeTeleopError(
-            f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}",
-            where="replay",
-            remedy="give the log of a station with a simulated slave",
-        )
+        what = f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}"
+        remedy = "give the log of a station with a simulated slave"
+        raise DrakeTeleopError(what, where="replay", remedy=remedy)
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = np.searchsorted((result.t[1:] + result.t[:-1]) / 2, times)  # nearest in time
     # Read each signal of a log on disk once, and keep only the displayed rows.
@@ -161,21 +156,19 @@ def _row_norms(vectors: Array) -> Array:
 
 def _find_logs(run: Path) -> list[Path]:
     if not os.path.exists(run):
-        raise DrakeTeleopError(
-            "there is no such file or folder", where=str(run), remedy="give the folder of a run"
-        )
+        what = "there is no such file or folder"
+        raise DrakeTeleopError(what, where=str(run), remedy="give the folder of a run")
     if run.suffix == ".parquet":
         return [run]
     if (run / "log.parquet").exists():
         return [run / "log.parquet"]
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
-        raise DrakeTeleopError(
-            "contains no log of a run",
-            where=str(run),
-            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
-            " stores measures only: run one of its points as a scenario",
+        remedy = (
+            "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+            " stores measures only: run one of its points as a scenario"
         )
+        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 
@@ -183,11 +176,8 @@ def _find_scenario(log: Path) -> Path:
     for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
         if path.exists():
             return path
-    raise DrakeTeleopError(
-        "this log has no scenario file beside it",
-        where=str(log),
-        remedy="give --scenario, a shipped one or a YAML file",
-    )
+    remedy = "give --scenario, a shipped one or a YAML file"
+    raise DrakeTeleopError("this log has no scenario file beside it", where=str(log), remedy=remedy)
 
 
 class ReplayScene:
@@ -309,8 +299,12 @@ class _ReplayDevice(NamedTuple):
 
 
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
-    if scenario.master.leader is not None:
-        return _add_leader_arm(plant, scenario.master.leader)
+    if (leader := scenario.master.leader) is not None:
+        order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
+        on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])
+        arm = leader.add_to_plant(plant, on_table)
+        hand, grip = arm.sensor_frame, np.zeros(3)
+        return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order], arm.mesh_folder)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
@@ -318,14 +312,6 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
     return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
-
-
-def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
-    order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
-    parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
-    return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), lambda q: q[order], parsed.mesh_folder
-    )
 
 
 def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
@@ -346,13 +332,9 @@ def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: 
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
         stand = part.floor_stand
         if stand is not None and stand.height > 0:
-            size, centre = (
-                (stand.size_x, stand.size_y, stand.height),
-                (stand.centre_x, stand.centre_y),
-            )
-            draw_box(
-                f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
-            )
+            size = stand.size_x, stand.size_y, stand.height
+            centre = stand.centre_x, stand.centre_y, stand.height / 2
+            draw_box(f"plinth_{k}" if k else "plinth", size, centre, _STEEL_COLOUR)
     set_plain_background(meshcat)
     aside = np.zeros(3) if with_table else _CAMERA_SHIFT_WITHOUT_DEVICE_W
     meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import (
     Cylinder,
     GeometryId,
@@ -26,8 +25,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.files import make_folder, write_text
 from drake_teleop.common.html import content_security_policy, render_page
+from drake_teleop.common.numeric import Array
 
-Array = NDArray[np.float64]
 ShowFrame = Callable[[float, int], None]
 """Function that shows a frame (index) at a time of the recording [s]."""
 

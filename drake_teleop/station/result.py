@@ -66,11 +66,9 @@ class Signal:
         for text in (self.name, self.description, *self.components, *units):
             expect_type(str, text, "signal")
         if len(units) != len(self.components):
-            raise DrakeTeleopError(
-                f"the signal has {len(self.components)} components, but {len(units)} units",
-                where=self.name,
-                remedy="give one unit, or one per component",
-            )
+            what = f"the signal has {len(self.components)} components, but {len(units)} units"
+            remedy = "give one unit, or one per component"
+            raise DrakeTeleopError(what, where=self.name, remedy=remedy)
 
     @property
     def columns(self) -> list[str]:
@@ -101,11 +99,8 @@ class SimulationResult:
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
-            raise DrakeTeleopError(
-                f"only one of `signals` and `specs` contains {', '.join(odd)}",
-                where="signals",
-                remedy="give each signal one spec",
-            )
+            what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
+            raise DrakeTeleopError(what, where="signals", remedy="give each signal one spec")
         self._values: Mapping[str, NDArray[np.float64]]
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
@@ -118,11 +113,9 @@ class SimulationResult:
         if array.ndim == 1:
             array = array[:, np.newaxis]
         if array.shape != shape:
-            raise DrakeTeleopError(
-                f"has shape {array.shape} instead of {shape} (times, components)",
-                where=name,
-                remedy="give a row per time and a column per component",
-            )
+            what = f"has shape {array.shape} instead of {shape} (times, components)"
+            remedy = "give a row per time and a column per component"
+            raise DrakeTeleopError(what, where=name, remedy=remedy)
         return _read_only_view(array)
 
     @property
@@ -196,11 +189,9 @@ class SimulationResult:
         try:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
-            raise DrakeTeleopError(
-                f"{error.name or 'a library'} is not installed, but pandas frames require it",
-                where="to_pandas",
-                remedy=remedy_to_install_extra("notebook"),
-            ) from None
+            what = f"{error.name or 'a library'} is not installed, but pandas frames require it"
+            remedy = remedy_to_install_extra("notebook")
+            raise DrakeTeleopError(what, where="to_pandas", remedy=remedy) from None
 
     def to_dataframe(self) -> pl.DataFrame:
         """Return one row per sample: ``t`` and a column ``signal.component`` per component."""
@@ -224,11 +215,9 @@ class SimulationResult:
 
         missing = [name for name in _SENSOR_LOG_COLUMNS_OF_SIGNAL if name not in self]
         if missing:
-            raise DrakeTeleopError(
-                f"the result contains no {', '.join(missing)} (a sensor log needs these signals)",
-                where="sensor log",
-                remedy="record the wrist sensor's signals",
-            )
+            what = f"the result contains no {', '.join(missing)} (a sensor log needs these signals)"
+            remedy = "record the wrist sensor's signals"
+            raise DrakeTeleopError(what, where="sensor log", remedy=remedy)
         columns: dict[str, NDArray[np.float64]] = {}
         for name, names in _SENSOR_LOG_COLUMNS_OF_SIGNAL.items():
             columns |= dict(zip(names, self[name].T, strict=True))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
-from drake_teleop.common.numeric import contact_spans
+from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
@@ -33,7 +33,6 @@ from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.posture_shapes import start_overlaps
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
 Warnings = Iterator[tuple[str, Spans]]
@@ -45,11 +44,8 @@ _MAX_CLOSED_SPAN_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
 _SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
-_MIN_COMMAND_LAG_M, _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = (
-    2e-3,
-    np.deg2rad(1.0),
-    np.deg2rad(0.2),
-)
+_MIN_COMMAND_LAG_M = 2e-3
+_MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
 _LEDGER_COMMAND_SETTLING_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
@@ -133,10 +129,8 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
             happened = result["ik_status"][:, 0] == status
             yield f"inverse kinematics: {status.name}", find_spans(t, happened)
     control = scenario.joint_control
-    asked, fastest = (
-        control.position_loop_gain_per_s * _joint_tracking_error(result),
-        arm.velocity_limit,
-    )
+    asked = control.position_loop_gain_per_s * _joint_tracking_error(result)
+    fastest = arm.velocity_limit
     if control.position_interface is not None:
         fastest = np.minimum(fastest, control.position_interface.max_speed)
     for what, values, limit in (

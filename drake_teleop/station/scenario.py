@@ -1,8 +1,10 @@
 """Scenarios: configuration of a station as dataclasses, read from YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
 import dataclasses
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -19,6 +21,7 @@ from drake_teleop.common.config import (
     quantity,
     settings,
     unchecked_assignments,
+    with_absolute_paths,
 )
 from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.files import scenarios_dir
@@ -32,16 +35,17 @@ from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
-from drake_teleop.station.master.data_sheets import Master, data_sheet_in_settings
+from drake_teleop.station.master.data_sheets import FIGURES, Master
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import check_distance
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
-from drake_teleop.station.sensor.presets import preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import JointControlConfig, position_interface_of_servo
+from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.position_servo import POSITION_INTERFACES
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -80,20 +84,14 @@ class Simulation:
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
     settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
     integrator: str = choice(
-        "runge_kutta3",
-        ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"),
-        "Drake's name of the integration scheme",
+        "runge_kutta3", ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"), "Drake's scheme"
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
-    end_with_task: bool = plain(
-        False, "end the run within 20 ms after the operator finishes or gives up"
-    )
+    end_with_task: bool = plain(False, "end within 20 ms after the operator finishes or gives up")
     on_fault: str = choice(
-        "continue",
-        ("continue", "stop"),
-        "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
+        "continue", ("continue", "stop"), "after a fault: go on in a safe state, or end in an error"
     )
 
 
@@ -167,11 +165,8 @@ class Scenario:
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
             if sum(isinstance(thing, kind) for thing in self._touchables) > 1:
-                raise DrakeTeleopError(
-                    f"the scenario has more than one {name} (one is permitted)",
-                    where=f"{where}:environment",
-                    remedy="keep one",
-                )
+                what = f"the scenario has more than one {name} (one is permitted)"
+                raise DrakeTeleopError(what, where=f"{where}:environment", remedy="keep one")
         _check_task(self, where)
         _check_integration_step(self, where)
         _check_channel(self, where)
@@ -199,14 +194,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
     data, where = ReadScenarioData(name_or_path)
-    scenario = ScenarioFromData(data, where)
-    folder = Path(where).parent
-    scenario.slave = scenario.slave.with_absolute_paths(folder)
-    scenario.master = scenario.master.with_absolute_paths(folder)
-    scenario.environment = [
-        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
-        for thing in scenario.environment
-    ]
+    scenario: Scenario = with_absolute_paths(ScenarioFromData(data, where), Path(where).parent)
     return scenario
 
 
@@ -250,12 +238,15 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     `where` is the file's name for messages.
     """
     check_structure(Scenario, data, where)  # before the presets are read
+
+    def find_preset(table: Mapping[str, Any], block: str, field: str) -> Any:
+        return copy.deepcopy(table.get(str((data.get(block) or {}).get(field))))
+
+    interface = find_preset(POSITION_INTERFACES, "joint_control", "servo")
     defaults = Scenario(
-        wrist_sensor=preset_of_block(data.get("wrist_sensor")),
-        master=Master(figures=data_sheet_in_settings(data.get("master"))),
-        joint_control=JointControlConfig(
-            interface=position_interface_of_servo(data.get("joint_control"))
-        ),
+        wrist_sensor=find_preset(PRESETS, "wrist_sensor", "preset") or WristSensorConfig(),
+        master=Master(figures=find_preset(FIGURES, "master", "model")),
+        joint_control=JointControlConfig(interface=interface),
     )
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
@@ -277,11 +268,9 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
-                raise DrakeTeleopError(
-                    f"{block} is null or a text in this scenario, so it has no field {inner}",
-                    where=place,
-                    remedy=f"set the whole block {block} first",
-                )
+                what = f"{block} is null or a text in this scenario, so it has no field {inner}"
+                remedy = f"set the whole block {block} first"
+                raise DrakeTeleopError(what, where=place, remedy=remedy)
             check_field(type(config), inner, value, place)
             value = dataclasses.replace(config, **{inner: value})
         check_field(Scenario, block, value, f"scenario:{block}")
@@ -305,11 +294,9 @@ def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     fixed = simulation.integrator != "runge_kutta3"
     if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_CONTACT_STEP_S:
-        raise DrakeTeleopError(
-            f"fixed steps of {simulation.max_step:g} s are too long for contact",
-            where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
-        )
+        what = f"fixed steps of {simulation.max_step:g} s are too long for contact"
+        remedy = f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3"
+        raise DrakeTeleopError(what, where=f"{where}:simulation.max_step", remedy=remedy)
 
 
 def _check_channel(scenario: Scenario, where: str) -> None:
@@ -325,16 +312,12 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     if scenario.master.is_joint_leader and not (
         scenario.has_direct_channel and scenario.contact_detection is None
     ):
-        raise DrakeTeleopError(
-            "a leader that commands joints requires a direct channel (a network transmits poses)",
-            where=f"{where}:master.leader.leads",
-            remedy="set it to pose, or remove network, passivity and contact_detection",
-        )
+        what = "a leader that commands joints requires a direct channel (a network transmits poses)"
+        remedy = "set it to pose, or remove network, passivity and contact_detection"
+        raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) == 0.0:
-        raise DrakeTeleopError(
-            "passivity methods require kinematic scales above 0",
-            where=f"{where}:passivity.method",
-            remedy="set both scales of kinematic_scaling above 0, or method: none",
-        )
+        what = "passivity methods require kinematic scales above 0"
+        remedy = "set both scales of kinematic_scaling above 0, or method: none"
+        raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

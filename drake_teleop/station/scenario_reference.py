@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
 from drake_teleop.common.texts import format_yaml_value, parse_yaml
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
-from drake_teleop.station.sensor.presets import preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _MAX_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
@@ -74,11 +75,8 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     if found != scenario and _texts_in(found) != _texts_in(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
         lost = [n for n in names if _texts_in(getattr(found, n)) != _texts_in(getattr(scenario, n))]
-        raise DrakeTeleopError(
-            f"YAML cannot represent the scenario's block {' and '.join(lost)}",
-            where=where,
-            remedy="use printable texts, numbers and lists",
-        )
+        what = f"YAML cannot represent the scenario's block {' and '.join(lost)}"
+        raise DrakeTeleopError(what, where=where, remedy="use printable texts, numbers and lists")
     write_text(path, text)
 
 
@@ -112,7 +110,7 @@ def _block_lines(config: Any) -> list[str]:
     column = min(_MAX_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = None
     if isinstance(config, WristSensorConfig):
-        preset = preset_of_block({"preset": config.preset})
+        preset = PRESETS.get(config.preset, WristSensorConfig())
     lines = []
     for entry in entries:
         if entry.kind == "block":
@@ -180,15 +178,11 @@ def _titles_of_blocks(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
 
 def _links_to_blocks(entry: FieldInfo, path: str) -> str:
     several = len(entry.blocks) > 1
-    links = [
-        f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor_of_title(title)})"
-        for title, block in _titles_of_blocks(entry, path)
-    ]
+    links = []
+    for title, block in _titles_of_blocks(entry, path):
+        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+        links.append(f"[{f'!{block.__name__}' if several else 'block'}](#{anchor})")
     return f"{'list of ' * entry.list_depth}{', '.join(links)}{', or null' * entry.optional}"
-
-
-def _anchor_of_title(title: str) -> str:
-    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
 def _object_schema(config: Any) -> dict[str, Any]:
@@ -221,5 +215,6 @@ def _item_schema(entry: FieldInfo, block: type | None) -> dict[str, Any]:
     types = {"number": "number", "whole number": "integer", "true or false": "boolean"}
     schema: dict[str, Any] = {"type": types.get(entry.kind, "string")}
     if entry.unit:
-        schema |= {"minimum": entry.low, "maximum": entry.high}
+        limits = {"minimum": entry.low, "maximum": entry.high}
+        schema |= {name: limit for name, limit in limits.items() if limit not in (None, math.inf)}
     return schema

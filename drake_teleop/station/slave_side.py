@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.numeric import check_nonzero_load, finite_array
+from drake_teleop.common.numeric import Array, check_nonzero_load, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -35,9 +34,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
-from drake_teleop.station.wiring import connect_ports, export_outputs
-
-Array = NDArray[np.float64]
+from drake_teleop.station.wiring import connect_inputs, connect_ports, export_outputs
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 SLAVE_MONITOR_PERIOD_S = 0.01
@@ -123,26 +120,20 @@ def MakeSlaveSide(
         export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
-    state = body.slave.plant.get_state_output_port(body.slave.instance)
-    builder.Connect(state, kinematics.GetInputPort("slave_state"))
+    connect_inputs(builder, kinematics, body.slave.ports)
     export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
         inputs = body.sample_ports | {
-            "slave_state": state,
+            "slave_state": body.slave.ports["slave_state"],
             "pose_slave": kinematics.GetOutputPort("pose_slave"),
             "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
         }
-        for name, port in inputs.items():
-            if controller.HasInputPort(name):
-                builder.Connect(port, controller.GetInputPort(name))
+        connect_inputs(builder, controller, inputs)
 
     if scenario.contact_detection is not None:
         if noise_floor is None:
-            raise DrakeTeleopError(
-                "no noise floor given",
-                where="contact_detection",
-                remedy="pass noise_floor=identify_load(...).noise_floor",
-            )
+            remedy = "pass noise_floor=identify_load(...).noise_floor"
+            raise DrakeTeleopError("no noise floor given", where="contact_detection", remedy=remedy)
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
@@ -223,58 +214,41 @@ def _add_slave_blocks(
 ) -> _SlaveBlocks:
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
-    arm, plant, start = slave.arm, slave.plant, slave.start
-    state = plant.get_state_output_port(slave.instance)
-    builder.ExportOutput(state, "slave_state")
+    arm, plant, start, ports = slave.arm, slave.plant, slave.start, slave.ports
+    builder.ExportOutput(ports["slave_state"], "slave_state")
 
     own_servo = q_start is None and not custom_torque
     samples = _servo_samples_per_event(scenario, slave) if own_servo else 1
-    ramps, period = samples > 1, 1 / rates.joint_control_hz
+    period = 1 / rates.joint_control_hz
     if custom_torque:
         servo: LeafSystem = HeldTorque(arm, period, start)
-    elif ramps:
-        servo = SampledServo(slave, scenario.joint_control, period, samples, start)
+    elif samples > 1:
+        servo = SampledServo(slave, scenario.joint_control, period, samples)
     else:
         servo = MakeJointControl(arm, scenario.joint_control, period, start)
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
     _check_friction_time_step(slave, min(held, scenario.simulation.max_step))
-    torque = control.GetOutputPort("joint_torque")
-    builder.Connect(state, control.GetInputPort("slave_state"))
-    builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
+    connect_inputs(builder, control, ports)
+    names = [name for name in ("joint_torque", "torque_rate") if control.HasOutputPort(name)]
+    torque = {name: control.GetOutputPort(name) for name in names}
+    builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
     monitor = builder.AddNamedSystem("monitor", JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S))
-    builder.Connect(state, monitor.GetInputPort("slave_state"))
+    connect_inputs(builder, monitor, ports)
 
     motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
-    sample = AddCompiledWristSensor(
-        builder, slave, sensor, motion, sensor_period, held, start, ramps=ramps
-    )
-    wrist = builder.GetSubsystemByName("wrist_sensor")
-    acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
-    builder.Connect(state, wrist.GetInputPort("slave_state"))
-    builder.Connect(acceleration, wrist.GetInputPort("slave_acceleration"))
-    builder.Connect(torque, wrist.GetInputPort("joint_torque"))
-    if ramps:
-        rate = control.GetOutputPort("torque_rate")
-        builder.Connect(rate, wrist.GetInputPort("torque_rate"))
-        if slave.compiled_sheet_instance is not None:
-            sheet = plant.get_state_output_port(slave.compiled_sheet_instance)
-            builder.Connect(sheet, control.GetInputPort("sheet_state"))
+    sample = AddCompiledWristSensor(builder, slave, sensor, motion, sensor_period, held, torque)
     for name, port in sample.items():
         builder.ExportOutput(port, name)
 
-    estimator = LoadEstimator(
-        scenario.load_estimator,
-        sensor.wrench_std(),
-        estimated_motion_std(motion, sensor, arm.num_joints, sensor_period),
-        1 / rates.estimator_hz,
-        sample["sample"].size(),
-        np.zeros(16) if load_estimate is None else load_estimate,
-        load_covariance,
-        scenario.force_scaling.gripper_phi,
-    )
+    motion_std = estimated_motion_std(motion, sensor, arm.num_joints, sensor_period)
+    sampling = 1 / rates.estimator_hz, sample["sample"].size()
+    initial = np.zeros(16) if load_estimate is None else load_estimate, load_covariance
+    config, gripper = scenario.load_estimator, scenario.force_scaling.gripper_phi
+    noise = sensor.wrench_std(), motion_std
+    estimator = LoadEstimator(config, *noise, *sampling, *initial, gripper)
     builder.AddNamedSystem("load_estimator", estimator)
     # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
@@ -285,7 +259,7 @@ def _add_slave_blocks(
         export_outputs(builder, estimator, "load_state")
 
     if slave.can_touch:
-        _add_tool_contact(builder, slave, state)
+        _add_tool_contact(builder, slave)
     return _SlaveBlocks(slave, control, monitor, estimator, sample, held)
 
 
@@ -312,38 +286,27 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
         )
 
 
-def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:
-    plant = slave.plant
+def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:
+    plant, ports = slave.plant, slave.ports
+    block: LeafSystem = ToolContact(slave.arm, slave.contact)
     if slave.contact.drake_contact_reason:
-        contact = builder.AddNamedSystem(
-            "tool_contact", DrakeContact(slave.contact.tool_bodies, slave.contact.tool_shapes)
-        )
-        results = plant.get_contact_results_output_port()
-        builder.Connect(results, contact.GetInputPort("contact_results"))
-    else:
-        contact = builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact))
-        builder.Connect(state, contact.GetInputPort("slave_state"))
-        if slave.contact.plant_state_size:
-            builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
+        block = DrakeContact(slave.contact.tool_bodies, slave.contact.tool_shapes)
+    contact = builder.AddNamedSystem("tool_contact", block)
+    connect_inputs(builder, contact, ports)
     export_outputs(builder, contact, "true_contact_wrench_W")
-    if slave.contact.leaf_instance is not None:
-        sheet = plant.get_state_output_port(slave.contact.leaf_instance)
-        builder.ExportOutput(sheet, "sheet_state")
-        if slave.compiled_sheet_instance is not None:
-            builder.Connect(sheet, contact.GetInputPort("sheet_state"))
+    if "sheet_state" in ports:
+        builder.ExportOutput(ports["sheet_state"], "sheet_state")
     for name, body in slave.contact.moving_bodies.items():
         pose = builder.AddNamedSystem(MOVING_BODY_POSE_PREFIX + name, MovingBodyPose(plant, body))
-        builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
+        connect_inputs(builder, pose, ports)
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     if hasattr(estimate, "estimate"):
-        raise DrakeTeleopError(
-            f"expected 16 numbers, found {type(estimate).__name__}",
-            where="load_estimate",
-            remedy="pass the attribute .estimate of this object",
-        )
+        what = f"expected 16 numbers, found {type(estimate).__name__}"
+        remedy = "pass the attribute .estimate of this object"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
     if estimate is not None:
         estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
@@ -351,17 +314,13 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     scales = scenario.force_scaling.scales()
     needed = {*scales.load_scales} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
-        raise DrakeTeleopError(
-            "sigma and gamma differ, which requires a load estimate, but there is none",
-            where="load_estimate",
-            remedy="pass the estimate of identify_load, or set load_estimator.enabled",
-        )
+        what = "sigma and gamma differ, which requires a load estimate, but there is none"
+        remedy = "pass the estimate of identify_load, or set load_estimator.enabled"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
     if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
-        raise DrakeTeleopError(
-            "contact detection requires a load estimate, but there is none",
-            where="load_estimate",
-            remedy="pass the estimate of identify_load as load_estimate",
-        )
+        what = "contact detection requires a load estimate, but there is none"
+        remedy = "pass the estimate of identify_load as load_estimate"
+        raise DrakeTeleopError(what, where="load_estimate", remedy=remedy)
 
 
 def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:

@@ -5,11 +5,10 @@ operator, haptic device --- network, passivity --- arm, wrist sensor, eliminatio
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from drake_teleop.common.errors import expect_type
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.channel_side import MakeChannel
@@ -22,8 +21,8 @@ from drake_teleop.station.wiring import build_with_log, connect_ports
 def MakeTeleopStation(
     scenario: Scenario,
     *,
-    load_estimate: NDArray[np.float64] | None = None,
-    load_covariance: NDArray[np.float64] | None = None,
+    load_estimate: Array | None = None,
+    load_covariance: Array | None = None,
     noise_floor: NoiseFloor | None = None,
     master: System | None = None,
     channel: System | None = None,

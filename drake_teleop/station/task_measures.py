@@ -8,32 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.operator.decision import (
-    CONTACT_PERCEIVED_INDEX,
-    OUTCOME_INDEX,
-    PHASE_APPROACHING,
-    PHASE_INDEX,
-    PHASE_MOVING,
-    PHASE_PRESSING,
-    PHASE_SEARCHING_SLOT,
-    PHASE_STOPPING,
-    PHASE_WAITING,
-)
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.operator import decision
 from drake_teleop.station.operator.task import TASK_MEASURE_NAMES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-Array = NDArray[np.float64]
-
 _SLOT_FLOOR_TOLERANCE_M = 2e-3  # m
 _PHASE_TEXTS = {
-    PHASE_MOVING: "moving to the target",
-    PHASE_APPROACHING: "approaching the contact",
-    PHASE_STOPPING: "stopped after contact",
-    PHASE_PRESSING: "pressing",
-    PHASE_SEARCHING_SLOT: "searching for the slot",
+    decision.PHASE_MOVING: "moving to the target",
+    decision.PHASE_APPROACHING: "approaching the contact",
+    decision.PHASE_STOPPING: "stopped after contact",
+    decision.PHASE_PRESSING: "pressing",
+    decision.PHASE_SEARCHING_SLOT: "searching for the slot",
 }
 
 
@@ -44,15 +33,13 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     """
     task = scenario.operator.task
     if task is None:
-        raise DrakeTeleopError(
-            "the scenario has no operator's task to measure",
-            where="operator.task",
-            remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
-        )
+        what = "the scenario has no operator's task to measure"
+        remedy = "give the operator a task: !Reach, !Touch, !Press or !Insert"
+        raise DrakeTeleopError(what, where="operator.task", remedy=remedy)
     state, t, ended = result["task_state"], result.t, _last_row_of_task(result)
-    begun = int(np.argmax(state[:, PHASE_INDEX] != PHASE_WAITING))
+    begun = int(np.argmax(state[:, decision.PHASE_INDEX] != decision.PHASE_WAITING))
     span = slice(begun, ended + 1)
-    done = state[ended, OUTCOME_INDEX] > 0.0
+    done = state[ended, decision.OUTCOME_INDEX] > 0.0
     force = contact_force(result)
     held = np.empty(0)
     if done and isinstance(task, Press):
@@ -60,7 +47,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     wanted = _required_contact_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
-    noticed, touching = state[span, CONTACT_PERCEIVED_INDEX] > 0.0, force[span] > 0.0
+    noticed, touching = state[span, decision.CONTACT_PERCEIVED_INDEX] > 0.0, force[span] > 0.0
     # The log may start after the start of the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
     success = done and not _failed_criterion(result, scenario, task, ended)
@@ -85,12 +72,12 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
     task, state, ended = scenario.operator.task, result["task_state"], _last_row_of_task(result)
     assert task is not None
-    at, outcome = float(result.t[ended]), state[ended, OUTCOME_INDEX]
+    at, outcome = float(result.t[ended]), state[ended, decision.OUTCOME_INDEX]
     if outcome > 0.0:
         wrong = _failed_criterion(result, scenario, task, ended)
         return f"the operator finished at {at:.2f} s, but {wrong}" if wrong else ""
-    phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), PHASE_INDEX])
-    if phase == PHASE_WAITING:
+    phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), decision.PHASE_INDEX])
+    if phase == decision.PHASE_WAITING:
         return f"the task begins at {task.t_start:g} s, when the simulation has ended"
     taken = at + scenario.simulation.settle - task.t_start
     found = f"{_PHASE_TEXTS[phase]}, {_force_and_position_text(result, scenario, task, ended)}"
@@ -111,7 +98,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
 
 
 def _last_row_of_task(result: SimulationResult) -> int:
-    outcome = result["task_state"][:, OUTCOME_INDEX]
+    outcome = result["task_state"][:, decision.OUTCOME_INDEX]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -47,6 +47,15 @@ def connect_ports(
     builder.Connect(output, port)
 
 
+def connect_inputs(
+    builder: DiagramBuilder, block: System, sources: Mapping[str, OutputPort]
+) -> None:
+    """Connect each output port to the input port of its name in `sources`, if the block has one."""
+    for name, port in sources.items():
+        if block.HasInputPort(name):
+            builder.Connect(port, block.GetInputPort(name))
+
+
 def build_with_log(
     builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
 ) -> Diagram:
@@ -77,8 +86,5 @@ def build_with_log(
 
 def _check_port_exists(port: Any, side: System, what: str) -> None:
     if not port:
-        raise DrakeTeleopError(
-            f"the block has no {what}",
-            where=side.get_name(),
-            remedy="docs/station.md lists the ports that each side has",
-        )
+        remedy = "docs/station.md lists the ports that each side has"
+        raise DrakeTeleopError(f"the block has no {what}", where=side.get_name(), remedy=remedy)

@@ -582,7 +582,10 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     ("options", "expected"),
     [
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
-        (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits, but 6 joints"),
+        (
+            ["--sensor-frame", "l6", "--acceleration", "1,2"],
+            "has 2 numbers, but the arm",
+        ),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "model contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),

@@ -7,6 +7,7 @@ from collections import UserDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import planted
@@ -284,7 +285,8 @@ def test_table_without_names_keeps_its_first_row(tmp_path: Path, first: str) -> 
     rows = [first, *(f"{0.01 * k:.2f},2.5,0,0,{k}" for k in range(1, 60))]
     (tmp_path / "x.csv").write_text("\n".join(rows))
     summary = inspect_command(tmp_path / "x.csv", tmp_path, quiet=True)
-    assert "places that were not recognized" in summary["findings"][0]["message"]
+    message = summary["findings"][0]["message"]
+    assert "not recognized: FILL IN wrench.force.columns, wrench.torque.columns" in message
     text = (tmp_path / "draft.yaml").read_text()
     assert "# Columns without a guess: 1, 2, 3, 4." in text
     wrench = yaml.safe_load(text)["wrench"]
@@ -302,6 +304,54 @@ def test_unknown_unit_has_a_placeholder(tmp_path: Path) -> None:
     assert "FILL IN" in summary["findings"][0]["message"]
     wrench = yaml.safe_load((tmp_path / "draft.yaml").read_text())["wrench"]
     assert (wrench["force"]["unit"], wrench["torque"]["unit"]) == ("FILL IN", "N m")
+
+
+@pytest.mark.slow
+def test_a_wrong_clock_and_the_sign_are_named_together(tmp_path: Path) -> None:
+    columns = good()
+    planted.sign(columns)
+    planted.wrench_clock(columns)
+    found = planted.findings(tmp_path, columns, imu=False)
+    assert set(found) == {"sign", "clock"}
+    assert "wrench.time.offset: -0.5" in found["clock"]
+
+
+def test_a_record_at_rest_is_a_finding(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    columns = {name: np.repeat(x[:1], len(x), axis=0) for name, x in good().items()}
+    columns["t"] = good()["t"]
+    for name, noise in (("force", 0.05), ("torque", 0.003)):
+        columns[name] = columns[name] + rng.normal(size=(2000, 3)) * noise
+    found = planted.findings(tmp_path, columns, imu=False)
+    assert set(found) == {"payload"} and "depends on its mass; record slow" in found["payload"]
+
+
+def drafted(names: str) -> dict[str, Any]:
+    columns = dict.fromkeys(names.split(", "), np.arange(60.0) * 0.01)
+    return draft_description(Table(Path("x.csv"), columns), Path()).streams
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "position"), [("Kraft ", "Moment ", "Ort "), ("力", "力矩", "位置")]
+)
+def test_a_vector_in_any_language_is_recognized_by_its_unit(
+    force: str, torque: str, position: str
+) -> None:
+    named = {force: "N", torque: "Nm", position: "mm"}
+    vectors = {name: [f"{name}{a.upper()} [{unit}]" for a in "xyz"] for name, unit in named.items()}
+    names = [name for columns in vectors.values() for name in columns]
+    draft = drafted(", ".join(["Zeit [ms]", *names, "qw, qx, qy, qz"]))
+    assert draft["wrench"]["force"] == {"columns": vectors[force], "unit": "N"}
+    assert draft["wrench"]["torque"] == {"columns": vectors[torque], "unit": "N m"}
+    assert draft["pose"]["position"] == {"columns": vectors[position], "unit": "mm"}
+
+
+def test_force_and_torque_are_those_of_one_sensor() -> None:
+    """Also if another one, which comes first, has only a force."""
+    cell, ft = (f"{x}_fx, {x}_fy, {x}_fz" for x in ("cell", "ft"))
+    draft = drafted(f"t, {cell}, b_tx, b_ty, b_tz, {ft}, ft_tx, ft_ty, ft_tz, qw, qx, qy, qz")
+    assert draft["wrench"]["force"]["columns"] == ["ft_fx", "ft_fy", "ft_fz"]
+    assert draft["wrench"]["torque"]["columns"] == ["ft_tx", "ft_ty", "ft_tz"]
 
 
 @pytest.mark.parametrize(

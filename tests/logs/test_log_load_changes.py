@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 import yaml
-from known_motion import motion_at
+from known_motion import GRAVITY_W, Motion, motion_at, quaternions
+from scipy.spatial.transform import Rotation
 from test_log_commands import GRAVITY, describe_poses, describe_record
 
 from drake_teleop.cli.logs import identify_command
@@ -23,7 +25,7 @@ from drake_teleop.load.online.change import (
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import block_means_of_record
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 
 TOOL = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
@@ -155,3 +157,91 @@ def utias(ntnu: Path) -> Path:
     if not folder.is_dir():
         pytest.skip("needs the records utias_workshop_tools, which the project does not ship")
     return folder
+
+
+def random_motion(t: np.ndarray) -> Motion:
+    """A brisk motion of sums of sines, by central differences of a rotation and a position."""
+    rng = np.random.default_rng(7)
+    rates, phases = 0.7 * rng.uniform(0.4, 1.6, (6, 3)), rng.uniform(0.0, 2.0 * np.pi, (6, 3))
+    sizes = np.repeat([0.6, 0.12], 3)[:, None] * rng.uniform(0.3, 0.8, (6, 3))
+    sizes, rates = sizes[..., None], 2.0 * np.pi * rates[..., None]
+
+    def pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = (sizes * np.sin(rates * t + phases[..., None])).sum(axis=1).T
+        return Rotation.from_euler("ZYX", x[:, :3] + [0.0, 0.0, 2.6]).as_matrix(), x[:, 3:]
+
+    h = 1e-4
+    (R, p), (after, p2), (before, p1) = pose(t), pose(t + h), pose(t - h)
+    turn = np.swapaxes(R, 1, 2) @ np.stack(
+        [(after - before) / (2 * h), (after - 2 * R + before) / h**2]
+    )
+    omega, alpha = (
+        np.stack(
+            [W[:, 2, 1] - W[:, 1, 2], W[:, 0, 2] - W[:, 2, 0], W[:, 1, 0] - W[:, 0, 1]], axis=1
+        )
+        / 2
+        for W in turn
+    )
+    s = np.einsum("nji,nj->ni", R, (p2 - 2 * p + p1) / h**2 - GRAVITY_W)
+    return Motion(t, R, p, s, omega, alpha)
+
+
+def posed_log(folder: Path, t: np.ndarray, wrench: np.ndarray, *, sign: float = 1.0) -> Path:
+    """A log of this wrench with the poses of the random motion."""
+    at = random_motion(t)
+    noise = np.random.default_rng(4).normal(size=wrench.shape)
+    wrench = sign * wrench + np.repeat([0.1, 0.005], 3) * noise
+    columns = {"q": quaternions(at.R_WS), "p": at.p_WS, "f": wrench[:, :3], "m": wrench[:, 3:]}
+    table = {f"{k}{i}": x[:, i] for k, x in columns.items() for i in range(x.shape[1])}
+    pl.DataFrame({"t": t} | table).write_parquet(folder / "log.parquet")
+    file = {"file": "log.parquet", "time": {"column": "t"}}
+    named = {k: {"columns": [f"{k}{i}" for i in range(x.shape[1])]} for k, x in columns.items()}
+    form = {"form": "quaternion_wxyz"}
+    log = {
+        "gravity": [float(x) for x in GRAVITY_W],
+        "wrench": {**file, "force": named["f"], "torque": named["m"]},
+        "pose": {**file, "orientation": named["q"] | form, "position": named["p"]},
+    }
+    (folder / "log.yaml").write_text(yaml.safe_dump(log))
+    return folder / "log.yaml"
+
+
+def load_wrench(t: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    at = random_motion(t)
+    return non_contact_wrench(at.specific_force, at.omega, at.alpha, phi)
+
+
+@pytest.mark.slow
+def test_delay_is_that_of_the_fit_with_the_load_change(tmp_path: Path) -> None:
+    t = np.arange(0.0, 20.0, 4e-3)
+    wrench = load_wrench(t, TOOL) - (t > 11.0)[:, None] * load_wrench(t, 0.8 * TOOL)
+    found = identify_log(posed_log(tmp_path, t, wrench))
+    assert [cause.name for cause in found.causes] == ["load change"]
+    assert found.identification.delay_s == pytest.approx(0.0, abs=2e-4)
+    residual = found.log.wrench - found.predicted
+    first = found.log.t - found.log.t[0] < 10.5
+    assert residual[first, :3].std() < 0.2
+
+
+@pytest.mark.slow
+def test_contact_in_most_of_a_record_leaves_the_load_of_the_rest(tmp_path: Path) -> None:
+    """Also with an inverted wrench; no change of the load between two contacts is named."""
+    t = np.arange(0.0, 30.0, 4e-3)
+    R = random_motion(t).R_WS
+    push = (np.sin(2.0 * np.pi * t / 7.0) > -0.3)[:, None] * np.einsum("nji,j->ni", R, [0, 0, 30.0])
+    arm = np.array([0.0, 0.0, 0.18])
+    wrench = load_wrench(t, TOOL) - np.hstack([push, np.cross(arm, push)])
+    found = identify_log(posed_log(tmp_path, t, wrench, sign=-1.0))
+    assert {cause.name for cause in found.causes} == {"axes", "contact"}
+    assert found.identification.mass == pytest.approx(TOOL[0], rel=2e-3)
+    assert found.identification.identifiable.all()
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_is_no_error_of_the_clock(tmp_path: Path) -> None:
+    t = np.arange(0.0, 20.0, 4e-3)
+    wrench = load_wrench(t, TOOL)
+    load = identify_log(posed_log(tmp_path, t, wrench)).identification
+    found = eliminate_log(posed_log(tmp_path, t, wrench, sign=-1.0), load)
+    assert [finding.name for finding in found.findings] == ["sign"]
+    assert "clock" not in str(found.log.notes)

@@ -126,8 +126,15 @@ def test_invalid_canonical_log_raises_error(
 
 
 def test_unknown_file_format_raises_error(tmp_path: Path) -> None:
+    (tmp_path / "log.xls").touch()
     with pytest.raises(DrakeTeleopError, match=r"'\.xls' is not known; give a canonical log"):
         read_log(tmp_path / "log.xls")
+    with pytest.raises(DrakeTeleopError, match=r"my_log: no such file; check the path"):
+        read_log(tmp_path / "my_log")
+    (tmp_path / "log.csv").mkdir()
+    for folder in (tmp_path, tmp_path / "log.csv"):
+        with pytest.raises(DrakeTeleopError, match=r"is a folder, not a file; check the path"):
+            read_log(folder)
     with pytest.raises(DrakeTeleopError, match=r"is a bag, .*; describe it"):
         read_log(tmp_path / "log.bag")
 

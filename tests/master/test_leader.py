@@ -216,12 +216,8 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
         (None, "master.leader: `model: leader` and the settings `leader` require each other"),
         (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires a file"),
         (
-            dataclasses.replace(LEADER, friction=[-1.0]),
-            "master.leader.friction: [-1.0] contains a number that is negative",
-        ),
-        (
             dataclasses.replace(LEADER, home=[0.0]),
-            "master.leader.home: 1 values do not fit a leader arm with 6 joints",
+            "master.leader.home: has 1 numbers, but the arm has 6 joints; give 6, for",
         ),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),
         (
@@ -235,3 +231,9 @@ def test_invalid_leader_gives_one_error(leader, said):
     scenario = replace(Scenario(), master=Master(model="leader", leader=leader))
     with pytest.raises(DrakeTeleopError, match=re.escape(said)):
         MakeMasterSide(scenario)
+
+
+@pytest.mark.parametrize("name", ["home", "friction", "damping", "torque_limit"])
+def test_each_setting_of_a_leaders_joints_is_finite(name):
+    with pytest.raises(DrakeTeleopError, match=f"Leader.{name}: nan .* is outside"):
+        dataclasses.replace(LEADER, **{name: [np.nan]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,9 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.robots.compensate import run_compensate_command
+from drake_teleop.robots.controller.export import export_controller
 from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY_M_S2, export_load
 
 MASS, COM = 1.7, np.array([0.012, -0.034, 0.091])
@@ -229,3 +233,20 @@ def test_removed_weight_is_not_subtracted_again(to) -> None:
             export_load(weightless, to)
     else:
         assert export_load(weightless, to) == export_load(FOUND, to)
+
+
+def test_controller_code_and_compensate_warn_of_a_load_that_is_not_identified(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also of its mass."""
+    identifiable = np.repeat([True, False], [6, 10])
+    unsure = dataclasses.replace(FOUND, identifiable=identifiable, covariance=1e6 * np.eye(16))
+    warnings = export_controller(unsure, "c99", tmp_path / "c", rate_hz=500.0)
+    for start in ("m, m c_x, m c_y, m c_z of the load are not identified", "I_xx, I_xy"):
+        assert any(text.startswith(start) for text in warnings)
+    unsure.save(tmp_path / "load.json")
+    log = Log(0.01 * np.arange(50.0), np.zeros((50, 6)), *np.ones((3, 50, 3)))
+    write_log(log, tmp_path / "log.csv")
+    out = str(tmp_path / "out.csv")
+    run_compensate_command(f"replay:{tmp_path / 'log.csv'}", tmp_path / "load.json", out)
+    assert "warning: m, m c_x, m c_y, m c_z of the load" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -195,6 +195,14 @@ def test_ros_2_faults_are_flagged() -> None:
         | ReadingFlag.RESTART
     )
     seen.check(flags | ReadingFlag.CLOCK_JUMP)
+
+
+@pytest.mark.parametrize("open_address", [open_sink, lambda address: ZenohSource(address, 0.002)])
+def test_absent_zenoh_router_is_one_error_line(open_address: Callable[[str], object]) -> None:
+    with pytest.raises(
+        DrakeTeleopError, match=r"^zenoh://127.0.0.1:\d+/ft: no zenoh router answers"
+    ):
+        open_address(f"zenoh://127.0.0.1:{free_port()}/ft")
 
 
 def test_ros_2_node_receives_the_wrench() -> None:

@@ -192,8 +192,8 @@ def test_imu_gives_the_motion() -> None:
 
 
 def test_wrench_without_motion_is_refused() -> None:
-    with pytest.raises(DrakeTeleopError, match="delivers no motion; give --motion"):
-        ReadingAssembler(ReadingStreams(StreamStub(WRENCH)))
+    with pytest.raises(DrakeTeleopError, match=r"^ros2://ft: delivers no motion; give --motion"):
+        ReadingStreams(StreamStub(WRENCH), where="ros2://ft")
 
 
 @pytest.mark.parametrize("angles", [(20.0, -35.0, 110.0), (0.0, 80.0, 30.0), (-170.0, 5.0, 0.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
 import runpy
@@ -18,10 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.sensor.presets import PRESETS, preset_of_block
+from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK_SIZE,
-    OFFSET_CONSTANTS,
     PARTS,
     PRESET_NAMES,
     SAMPLES_PER_NOISE_BLOCK,
@@ -247,7 +247,7 @@ def test_offset_drifts_and_may_change_during_a_run():
     np.testing.assert_allclose(error, expected, atol=1e-12)
 
     constants, memory = initialize_sensor_chain(part(offset=offset), JOINTS, PERIOD)
-    constants[OFFSET_CONSTANTS] += 5.0
+    constants.offset[:6] += 5.0
     reading = np.empty(13 + JOINTS)
     read_sensor_into(constants, memory, np.zeros(NOISE_BLOCK_SIZE), truths[0], reading)
     np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
@@ -296,13 +296,13 @@ def test_overload_including_offset_is_not_plausible():
     assert are_values_plausible(constants, truth)
     truth[0] = 0.99 * largest
     assert are_values_plausible(constants, truth)
-    constants[0] = 0.02 * largest  # as with the offset
+    constants.offset[0] = 0.02 * largest  # as with the offset
     assert not are_values_plausible(constants, truth)
     truth[0] = 0.0
     assert are_values_plausible(constants, truth)
-    constants[0] = np.nan
+    constants.offset[0] = np.nan
     assert not are_values_plausible(constants, truth)
-    constants[0] = 0.0
+    constants.offset[0] = 0.0
     for place in range(len(truth)):
         for bad in (np.nan, -np.inf, 1e9):
             assert not are_values_plausible(
@@ -488,9 +488,9 @@ def test_invalid_sensor_is_rejected(changes, message):
 
 
 def loaded(text):
-    config = yaml_load_typed(
-        schema=WristSensorConfig, data=text, defaults=preset_of_block(yaml_load(data=text))
-    )
+    preset = PRESETS.get(yaml_load(data=text).get("preset"), WristSensorConfig())
+    defaults = copy.deepcopy(preset)
+    config = yaml_load_typed(schema=WristSensorConfig, data=text, defaults=defaults)
     check_ranges(config, "sensor")
     return config
 

@@ -237,7 +237,7 @@ def test_primitive_replaces_a_mesh_with_its_pose_and_size(kind, by_box, expected
     """A box of 0.1 x 0.2 x 0.3 m, in any order and orientation; z is the longest axis."""
     X = RigidTransform(degrees(10, 20, 30), [0.4, -0.5, 0.6])
     triangles = Triangles(X.multiply((CORNERS * sides).T).T, FACES)
-    mesh = SimpleNamespace(triangles=lambda: triangles, inertia="exact")
+    mesh = SimpleNamespace(triangles=triangles, inertia="exact")
     X_found, size = fit_shape_to_mesh(mesh, kind, by_box=by_box)
     np.testing.assert_allclose(size, expected, atol=1e-12)
     np.testing.assert_allclose(X_found.translation(), X.translation(), atol=1e-12)

@@ -32,7 +32,7 @@ def positions_after_step(samples, hz, wall=None):
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(), wall)
     if samples > 1:
-        control = SampledServo(slave, CONFIG, 1 / hz, samples, slave.start)
+        control = SampledServo(slave, CONFIG, 1 / hz, samples)
     else:
         control = JointControl(slave.arm, CONFIG, 1 / hz, slave.start)
     builder.AddSystem(control)

@@ -42,13 +42,13 @@ def test_operational_inertia_gives_kinetic_energy(arm, home):
 def test_mass_bounds_kinetic_energy(arm, home):
     """One motion reaches the bound."""
     config = SCENARIO.joint_control
-    told = servo_at_tool(arm, home, config)
-    mass = np.diag(np.repeat(told.mass, 3))
-    spare = np.linalg.eigvalsh(mass - operational_inertia(arm, home))
-    assert spare[0] == pytest.approx(0.0, abs=1e-9) and told.mass[0] < 1e2
+    stiffness, damping, mass = servo_at_tool(arm, home, config)
+    bound = np.diag(np.repeat(mass, 3))
+    spare = np.linalg.eigvalsh(bound - operational_inertia(arm, home))
+    assert spare[0] == pytest.approx(0.0, abs=1e-9) and mass[0] < 1e2
     kp, kv = 2 * np.pi * config.position_bandwidth_hz, 2 * np.pi * config.velocity_bandwidth_hz
-    np.testing.assert_allclose(np.divide(told.stiffness, told.mass), kp * kv)
-    np.testing.assert_allclose(np.divide(told.damping, told.mass), kv)
+    np.testing.assert_allclose(np.divide(stiffness, mass), kp * kv)
+    np.testing.assert_allclose(np.divide(damping, mass), kv)
 
 
 def test_ledger_uses_arm_mass_by_default(arm, home, monkeypatch):

@@ -265,7 +265,8 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
 def _contact_cause(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
-        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part is not used",
+        f"from t = {start:.2f} to {stop:.2f} s the load is in contact or the sensor is saturated;"
+        " this part is not used",
         start_s=start,
         stop_s=stop,
     )

@@ -24,6 +24,7 @@ from drake_teleop.logs.causes.cause import (
     loads_between_changes,
 )
 from drake_teleop.logs.causes.changes import (
+    remove_small_steps,
     replace_contacts_by_steps,
     replace_steps_by_contact,
     shrink_contacts,
@@ -50,7 +51,7 @@ MAX_NOISE_RESIDUAL_RATIO, MAX_NOISE_SMOOTH_MISFIT, MAX_NOISE_EXTENSION_SCORE = 1
 """Limits of the noise test: residual ratio, smooth misfit and score of a larger model."""
 _MIN_CAUSE_SCORE, _NEAR_BEST_SCORE_MARGIN, _NEAR_BEST_SCORE_SHARE = 40.0, 25.0, 0.02
 _MAX_CONTACT_RESIDUAL_SHARE = 0.5
-_MUCH_SMALLER_RESIDUAL = 0.2
+_MUCH_SMALLER_RESIDUAL, _EQUAL_RESIDUAL = 0.2, 1.1
 _MAX_COLOURED_NOISE_RESIDUAL_RATIO = 15.0
 _MAX_EFFECTIVE_MISFIT_SHARE = 0.9
 _CERTAIN_CAUSE_SCORE = 1000.0
@@ -102,10 +103,9 @@ def search_causes(
         )
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.torque_factor > 0.0
-        if (
-            is_wrench
-            and opposite[0].residual_ratio < _MUCH_SMALLER_RESIDUAL * found[0].residual_ratio
-        ):
+        # An equal residual is sufficient for a positive mass, because a negative one is impossible.
+        share = _MUCH_SMALLER_RESIDUAL if has_negative_mass(opposite[0]) else _EQUAL_RESIDUAL
+        if is_wrench and opposite[0].residual_ratio < share * found[0].residual_ratio:
             found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
@@ -173,7 +173,8 @@ def _search_causes_from(
             larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
         elif larger.contact_spans != winner.state.contact_spans:
             larger = replace_contacts_by_steps(larger) or larger
-        state, delay_s = _apply_fitted_delay(larger, delay_s, with_delay)
+        # A contact can take all the samples before or after an earlier step.
+        state, delay_s = _apply_fitted_delay(remove_small_steps(larger), delay_s, with_delay)
         rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
             return state, delay_s, []

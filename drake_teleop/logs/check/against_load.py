@@ -70,7 +70,11 @@ class LoadFit:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_UNEXPLAINED + self.noise_share
+        return self.mass > 0 and self.unexplained < self.limit_beyond_noise(GOOD_UNEXPLAINED)
+
+    def limit_beyond_noise(self, share: float) -> float:
+        """Return the largest unexplained share for a `share` [of the variance] beside noise."""
+        return min(share + self.noise_share, UNDETERMINED_UNEXPLAINED_SHARE)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
@@ -172,10 +176,12 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
     delay = None if log.static else estimate_delay(data.read_whole_log(edited), 30.0)
-    if finding is None:  # The edit shifted the clock of the wrench to the nearest 20 ms.
-        assert description.wrench is not None and edited.wrench is not None
-        shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
-        return lag_finding(description, shift), shift
+    if description.wrench is not None and edited.wrench is not None:
+        shift = edited.wrench.time.offset - description.wrench.time.offset
+        if shift:  # of the clock of the wrench, to the nearest 20 ms
+            delay = shift + (delay or 0.0)
+    if finding is None:
+        return lag_finding(description, delay), delay
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
     first = Finding(finding.name, message, finding.fields)
@@ -200,9 +206,11 @@ def _edits_with_far_better_fit(
             fit is not None and finding is not None and finding.name not in _FINDINGS_INCLUDING_SIGN
         ):
             negative.append((fit, *edit_with_opposite_wrench_sign(finding, edited)))
+        elif fit is not None and finding is None:  # a clock and the sign
+            negative.append((fit, *next(wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = (
-        VALID_UNEXPLAINED + given.noise_share,
+        given.limit_beyond_noise(VALID_UNEXPLAINED),
         given.unexplained / min_unexplained_reduction_by_edit(given),
     )
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
@@ -264,14 +272,15 @@ def undetermined_payload_finding(load: Identification, unexplained: float) -> Fi
     if load.verdicts[6] != "not" and unexplained < UNDETERMINED_UNEXPLAINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
-    fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
-    if not np.isfinite(deviation):
-        fitted = "nothing here depends on its mass"
-    share = max(0.0, 100 * (1 - unexplained))
+    fitted = "nothing here depends on its mass"
+    if np.isfinite(deviation):
+        share = max(0.0, 100 * (1 - unexplained))
+        fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit, which explains {share:.0f} % of"
+        fitted += " the wrench's variance"
     return Finding(
         "payload",
-        f"payload not identifiable: {fitted}, which explains {share:.0f} % of the wrench's"
-        " variance; record slow rotations about two horizontal axes, without contact",
+        f"payload not identifiable: {fitted}; record slow rotations about two horizontal axes,"
+        " without contact",
     )
 
 

@@ -1,4 +1,4 @@
-"""Draft of a log description for unknown tables, from the names and magnitudes of columns."""
+"""Draft of a log description from names and magnitudes of columns (long: many spellings)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from drake_teleop.logs.read.description_fields import (
 )
 from drake_teleop.logs.read.tables import Table
 
-_TIME_NAME_PATTERN = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
+_TIME_NAME_PATTERN = (
+    r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?|zeit|temps|tiempo|tempo)(_?(s|ms|us|ns))?$"
+)
 # Ends of the names of vectors, before the axis.
 _VECTOR_NAME_PATTERNS = {
     "force": "f|forces?",
@@ -32,6 +34,11 @@ _VECTOR_NAME_PATTERNS = {
     "orientation": "q|quat|quaternion|orientation",
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
+_VECTORS_OF_ONE_INSTRUMENT = (
+    ("force", "torque"),
+    ("specific_force", "angular_velocity"),
+    ("orientation", "position"),
+)
 # Names of three angles, without their unit, and the axes about which they turn.
 _EULER_ANGLE_NAMES = {
     ("roll", "pitch", "yaw"): "xyz",
@@ -231,7 +238,7 @@ def _split_name_and_unit(name: str) -> tuple[str, str]:
     if unit is None and suffix is not None and suffix[1].lower() in _UNIT_OF_SPELLING:
         unit = suffix
     rest = name[: unit.start()] if unit else name
-    return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
+    return re.sub(r"[\W_]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
 def _remove_trailing_number(plain: str) -> str:
@@ -247,21 +254,42 @@ def _numbered_columns(plain: dict[str, tuple[str, str]], pattern: str) -> dict[s
 
 
 def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+    groups = {
+        kind: _group_axes(plain, kind, names) for kind, names in _VECTOR_NAME_PATTERNS.items()
+    }
     found: dict[str, _UnitColumns] = {}
-    for kind, names in _VECTOR_NAME_PATTERNS.items():
-        axes = "wxyz" if kind == "orientation" else "xyz"
-        ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
-        groups: dict[str, dict[str, str]] = {}
-        for name, (words, _) in plain.items():
-            if match := re.match(ends, words):
-                groups.setdefault(match[1], {}).setdefault(match[2], name)
-            elif kind == "position" and words in ("x", "y", "z"):
-                groups.setdefault("", {}).setdefault(words, name)
-        whole = [group for group in groups.values() if len(group) == len(axes)]
-        for group in (whole or list(groups.values()))[:1]:
-            columns = [group[axis] for axis in axes if axis in group]
-            found[kind] = _UnitColumns(columns, plain[columns[0]][1])
+    for pair in _VECTORS_OF_ONE_INSTRUMENT:
+        shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
+        for kind in pair:
+            for name in (shared or list(groups[kind]))[:1]:
+                columns = groups[kind][name]
+                found[kind] = _UnitColumns(columns, plain[columns[0]][1])
     return found
+
+
+def _group_axes(plain: dict[str, tuple[str, str]], kind: str, names: str) -> dict[str, list[str]]:
+    """Return the columns of each vector of this kind, whole ones if there are any, by its name."""
+    axes = "wxyz" if kind == "orientation" else "xyz"
+    ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
+    groups: dict[str, dict[str, str]] = {}
+    for name, (words, _) in plain.items():
+        if match := re.match(ends, words):
+            groups.setdefault(match[1], {}).setdefault(match[2], name)
+        elif kind == "position" and words in ("x", "y", "z"):
+            groups.setdefault("", {}).setdefault(words, name)
+    for name, (words, unit) in plain.items() if not groups else ():  # in another language
+        match = re.match(r"^(.*?)_?([xyz])$", words)
+        if match and _known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
+            groups.setdefault(match[1], {}).setdefault(match[2], name)
+    whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
+    return {
+        name: [group[axis] for axis in axes if axis in group]
+        for name, group in (whole or groups).items()
+    }
+
+
+def _known_unit(text: str) -> str:
+    return _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", text).lower(), "")
 
 
 def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
@@ -357,7 +385,7 @@ def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, A
     if kind in ("force", "torque") and _are_raw_counts(table, found.columns):
         group["scale"] = _FILL_IN_TEXT
     if found.unit:
-        unit = _UNIT_OF_SPELLING.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
+        unit = _known_unit(found.unit)
         group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
     if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):

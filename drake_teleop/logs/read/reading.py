@@ -57,11 +57,11 @@ from drake_teleop.logs.read.streams import (
     specific_force_at_So,
     uniform_times_of_streams,
 )
-from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table, require_file
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
 MIN_STATIC_POSES = 3
-_MIN_BANDWIDTH_HZ = 1e-3
+MIN_BANDWIDTH_HZ = 1e-3
 _CONVERTED_CHUNK_ROWS = 2**16
 _MIN_IMU_GAP_OVER_STEP = 4.0
 _EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
@@ -85,11 +85,11 @@ def read_log(
         DrakeTeleopError: naming file, field and remedy.
     """
     expect_type((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
+    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
             f"{bandwidth_hz:g} Hz is too low",
             where="bandwidth_hz",
-            remedy=f"give at least {_MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one",
+            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for the largest possible one",
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
@@ -102,6 +102,7 @@ def read_log(
         return reader.read_recording(keep_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise missing_topic_error(path)
+    require_file(path)
     raise DrakeTeleopError(
         f"format {path.suffix!r} is not known",
         where=str(path),

@@ -41,8 +41,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     The columns of a text file without header are named from "0" on.
     """
     kind = TABLE_READERS.check(path.suffix.lower(), str(path))
-    if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
-        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    require_file(path, folder=kind == ".zarr")
     refuse_fork()
     with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
         columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
@@ -50,6 +49,12 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
+
+
+def require_file(path: Path, *, folder: bool = False) -> None:
+    if not (os.path.isdir if folder else os.path.isfile)(path):
+        what = "is a folder, not a file" if os.path.isdir(path) else "no such file"
+        raise DrakeTeleopError(what, where=str(path), remedy="check the path")
 
 
 def _read_text(path: Path, header: bool = True) -> Table:

@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.controller.c99 import (
     ControllerTarget,
     Files,
@@ -75,9 +75,7 @@ def export_controller(
     if sensor_pose is not None:
         raise unused_sensor_pose_error(to)
     refuse_removed_weight(found, to)
-    notes = [
-        f"{name} is that of a point mass: it is not identified" for name in usable_phi(found)[1]
-    ]
+    notes = list(notes_on_undetermined_load(found))
     if largest is None:
         notes.append("no range of the sensor was given: saturation is not detected")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)

@@ -10,7 +10,6 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
 from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.channel.channel import (
     MIN_TIMEOUT_S,
     PORTS_SIGNAL_SIZE,
@@ -21,6 +20,7 @@ from drake_teleop.station.channel.channel import (
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.stepped_block import SteppedBlock
 
 
 class _PassivityEndBlock(SteppedBlock):

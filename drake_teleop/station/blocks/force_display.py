@@ -8,13 +8,13 @@ from pydrake.systems.framework import BasicVector, Context
 
 from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.numeric import Array, finite_array
-from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import (
     DISPLAYED_WRENCH_SLOTS,
     initial_display_state,
     step_display,
 )
+from drake_teleop.station.stepped_block import SteppedBlock
 
 
 class ForceDisplay(SteppedBlock):

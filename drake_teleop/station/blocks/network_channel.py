@@ -8,10 +8,10 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.blocks.stepped_block import SteppedBlock
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
+from drake_teleop.station.stepped_block import SteppedBlock
 
 
 class NetworkChannel(SteppedBlock):

@@ -174,11 +174,9 @@ def WrenchScaling_(T: Any) -> Any:
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
-                raise DrakeTeleopError(
-                    "the input port R_WS, the orientation of the sensor, is not connected",
-                    where="WrenchScaling.wrench_to_master",
-                    remedy="connect a rotation matrix, by rows",
-                )
+                what = "the input port R_WS, the orientation of the sensor, is not connected"
+                remedy = "connect a rotation matrix, by rows"
+                raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
             _compiled_or_python_function(wrench_to_master_into, T)(

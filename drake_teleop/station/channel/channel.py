@@ -4,24 +4,18 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
+from drake_teleop.common.blocks import all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.passivity import methods
+from drake_teleop.station.passivity import methods, safe_state
 from drake_teleop.station.passivity.memory import (
     CHANNEL_FILL_TIME_LEFT,
     LOAD_WRENCH,
@@ -38,16 +32,7 @@ from drake_teleop.station.passivity.packet import (
     dot_of_group,
     pose_difference_into,
 )
-from drake_teleop.station.passivity.safe_state import (
-    MASTER_MONITOR_SIZE,
-    SILENCE_TIME,
-    SLAVE_MONITOR_SIZE,
-    STOP_TIME_S,
-    initial_master_monitor,
-    initial_slave_monitor,
-    master_limits_into,
-    slave_command_into,
-)
+from drake_teleop.station.stepped_block import SteppedBlock
 
 _NETWORK_CHOICES = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
@@ -61,12 +46,8 @@ _TIMEOUT_PER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence o
 class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
-    network: str = choice(
-        "custom", _NETWORK_CHOICES, "a preset, or custom for the network of these fields"
-    )
-    backward: NetworkConfig | None = plain(
-        None, "network from slave to master; null: as from master to slave"
-    )
+    network: str = choice("custom", _NETWORK_CHOICES, "a preset, or custom for these fields")
+    backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
     timeout: float | None = quantity(
         None,
         "s",
@@ -83,11 +64,9 @@ class Channel(NetworkConfig):
         if self.network == "custom":
             return own, own if self.backward is None else self.backward
         if own != NetworkConfig() or self.backward is not None:
-            raise DrakeTeleopError(
-                f"preset '{self.network}' cannot be combined with other channel fields",
-                where=f"{where}.network",
-                remedy="remove these fields, or set network: custom",
-            )
+            what = f"preset '{self.network}' cannot be combined with other channel fields"
+            remedy = "remove these fields, or set network: custom"
+            raise DrakeTeleopError(what, where=f"{where}.network", remedy=remedy)
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:
@@ -102,7 +81,9 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
+_ENDS_STATE_SIZE = (
+    2 + 2 * (8 + 6 + MEMORY_SIZE) + safe_state.MASTER_MONITOR_SIZE + safe_state.SLAVE_MONITOR_SIZE
+)
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
@@ -111,13 +92,11 @@ _LAST_FINITE_SLAVE_POSE = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
-_SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
+_MASTER_SILENCE_MONITOR = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
+_SLAVE_SILENCE_MONITOR = _layout.vector(safe_state.SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
-# Transformation of a wrench at the hand to the world, one array.
-_layout = SlotAllocator(11)
-_R_WB_ROWS = _layout.vector(9)  # R_WB by rows
-_MOTION_SCALES = _layout.vector(2)  # of translation and rotation
+# Transformation of a wrench at the hand to the world: R_WB by rows, scales of motion.
+_R_WB_ROWS, _MOTION_SCALES = slice(0, 9), slice(9, 11)
 # Recorded values, see `ports` of `TeleopChannel`.
 PORTS_SIGNAL_SIZE = 8
 _layout = SlotAllocator(PORTS_SIGNAL_SIZE)
@@ -133,15 +112,13 @@ _MIN_DELAY_STEPS = 1
 _ZERO_LOAD_WRENCH = np.zeros(6)
 
 
-def initial_state_of_ends(
-    method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_FINITE_MASTER_POSE][:7] = ends[_LAST_FINITE_SLAVE_POSE][:7] = start
-    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = STOP_TIME_S
-    ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
-    ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
+    ends[_TIME_WITH_VALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
+    ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
+    ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
     ends[MASTER_METHOD_MEMORY] = ends[SLAVE_METHOD_MEMORY] = memory
     return ends
@@ -149,27 +126,10 @@ def initial_state_of_ends(
 
 @njit(cache=True)
 def step_channel(
-    steps,
-    pose_command,
-    wrench_B,
-    load_B,
-    hand_B,
-    slave_pose,
-    saturated,
-    contact,
-    T,
-    timeout,
-    frame,
-    parameters,
-    forward_parameters,
-    backward_parameters,
-    forward,
-    backward,
-    ends,
-    pose_received,
-    ports,
-    wrench_received,
-):
+    steps, pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact, T, timeout,
+    frame, parameters, forward_parameters, backward_parameters, forward, backward, ends,
+    pose_received, ports, wrench_received,
+):  # fmt: skip
     """Run one step of both ends and of both directions of the network.
 
     Args:
@@ -199,8 +159,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_TIME]
-    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][0] = ends[_MASTER_SILENCE_MONITOR][safe_state.SILENCE_TIME]
+    ports[_SILENCE_TIMES_OF_ENDS][1] = ends[_SLAVE_SILENCE_MONITOR][safe_state.SILENCE_TIME]
 
 
 @njit(cache=True)
@@ -228,7 +188,9 @@ def step_master_end(
         valid = False
     healthy = fresh and received[SENDER_INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
-    master_limits_into(healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits)
+    safe_state.master_limits_into(
+        healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits
+    )
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
         packet,
@@ -264,7 +226,7 @@ def step_slave_end(
     else:
         # Blend from the kept wrench to the measured one.
         _convert_wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
+        share = T / max(safe_state.STOP_TIME_S - ends[_TIME_WITH_VALID_SLAVE_WRENCH], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _convert_wrench_to_world(load_B, frame, wrench)
@@ -281,7 +243,7 @@ def step_slave_end(
         packet[SENDER_INPUTS_FINITE] = 0.0
     packet[CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
-    slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
+    safe_state.slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
     pose_difference_into(pose_received, left, dx)
     for g in range(2):
@@ -323,7 +285,7 @@ def _convert_wrench_to_master(wrench, frame, out):
             out[3 * g + i] = total * scales[g]
 
 
-class TeleopChannel(LeafSystem):
+class TeleopChannel(SteppedBlock):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
     While the wrist sensor is saturated, the last valid wrench is used.
@@ -354,16 +316,16 @@ class TeleopChannel(LeafSystem):
         start: (7,) pose X_WS of the slave at the start.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = ()
 
     def __init__(
         self,
         channel: Channel,
         passivity: PassivityConfig,
-        R_WB: NDArray[np.float64],
-        scales: NDArray[np.float64],
+        R_WB: Array,
+        scales: Array,
         force_scale: float,
-        start: NDArray[np.float64],
+        start: Array,
         period: float,
         seed: int,
     ) -> None:
@@ -391,92 +353,48 @@ class TeleopChannel(LeafSystem):
         receivers, in_transit = zip(
             *(network.initial_network_state(p, carried) for p in lines), strict=True
         )
-        state = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE)]
+        results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)
-        received = np.zeros(7)
-        groups = [self.DeclareDiscreteState(part) for part in state]
-        self._groups = [int(group) for group in groups]  # faster than Drake's own indices
+        step = {self._declare_step(results, len(results) - 1, period)}
         # Packets in transit are abstract parameters, which a context clones. Drake would copy a
         # discrete state several times a step: 1.5 MB for `lunar`.
         self._in_transit = [
             self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in in_transit
         ]
-        self.DeclareStateOutputPort("pose_received", groups[3])
-        self.DeclareStateOutputPort("ports", groups[4])
-        # One step computes the present wrench and the next state.
-        step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(
-                allocate=lambda: AbstractValue.Make([*map(np.array, state), received.copy()]),
-                calc=weak_callback(self._calc_step),
-            ),
-            {self.all_input_ports_ticket(), self.xd_ticket()},
-        )
-        self._step = step.cache_index()  # the entry itself would keep the block alive
-        step_ticket = {step.ticket()}
-        self.DeclareVectorOutputPort(
-            "wrench_received", 6, weak_callback(self._calc_wrench), step_ticket
-        )
-        self.DeclareVectorOutputPort(
-            "contact_at_hand", 1, weak_callback(self._calc_contact_flag), step_ticket
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_state)
+        for name, state in (("pose_received", 3), ("ports", 4)):
+            self.DeclareStateOutputPort(name, DiscreteStateIndex(self._states[state]))
+        wrench, contact = weak_callback(self._calc_wrench), weak_callback(self._calc_contact_flag)
+        self.DeclareVectorOutputPort("wrench_received", 6, wrench, step)
+        self.DeclareVectorOutputPort("contact_at_hand", 1, contact, step)
 
-    def Restart(
-        self,
-        context: Context,
-        command: NDArray[np.float64],
-        slave: NDArray[np.float64],
-        fills: float,
-    ) -> None:
+    def Restart(self, context: Context, command: Array, slave: Array, fills: float) -> None:
         """Restart the channel in a running station, without packets, at a constant slave command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_FINITE_SLAVE_POSE][:7], ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = (
-            slave,
-            fills,
-        )
-        context.SetDiscreteState(self._groups[2], ends)
-        context.SetDiscreteState(self._groups[3], command)
+        ends[_LAST_FINITE_SLAVE_POSE][:7] = slave
+        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fills
+        context.SetDiscreteState(self._states[2], ends)
+        context.SetDiscreteState(self._states[3], command)
 
-    def _calc_step(self, context: Context, step: AbstractValue) -> None:
-        *state, received = step.get_mutable_value()
-        for part, group in zip(state, self._groups, strict=True):
-            part[:] = context.get_discrete_state(group).value()
+    def _advance(self, context: Context, results: list[Array]) -> None:
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
-        forward, backward = zip(state[:2], in_transit, strict=True)
+        forward, backward = zip(results[:2], in_transit, strict=True)
         load = _ZERO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
-        step_channel(
-            self._steps,
-            self._pose.Eval(context),
-            self._wrench.Eval(context),
-            load,
-            self._hand.Eval(context),
-            self._slave.Eval(context),
-            self._saturated.Eval(context)[0] > 0.5,
-            self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
-            *self._constants,
-            forward,
-            backward,
-            *state[2:],
-            received,
-        )
-
-    def _evaluate_step(self, context: Context) -> list[NDArray[np.float64]]:
-        return self.get_cache_entry(self._step).Eval(context)
+        hand_and_slave = self._hand.Eval(context), self._slave.Eval(context)
+        inputs = self._pose.Eval(context), self._wrench.Eval(context), load, *hand_and_slave
+        saturated = self._saturated.Eval(context)[0] > 0.5
+        contact = self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0
+        states = *self._constants, forward, backward, *results[2:]
+        step_channel(self._steps, *inputs, saturated, contact, *states)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate_step(context)[-1][_RECEIVED_WRENCH])
+        output.SetFromVector(self._step_results(context)[-1][_RECEIVED_WRENCH])
 
     def _calc_contact_flag(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._evaluate_step(context)[-1][_RECEIVED_CONTACT_FLAG]
-
-    def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._evaluate_step(context), self._groups, strict=False):
-            discrete_state.set_value(group, part)
+        output[0] = self._step_results(context)[-1][_RECEIVED_CONTACT_FLAG]

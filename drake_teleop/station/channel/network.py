@@ -15,6 +15,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.packet import (
     PACKET_LOAD_WRENCH,
@@ -53,9 +54,7 @@ class NetworkConfig:
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
     playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age of a packet that is used")
-    redundant: bool = plain(
-        False, "each packet repeats the samples that the playout buffer may still wait for"
-    )
+    redundant: bool = plain(False, "packets repeat the samples that the playout buffer may await")
     trace: str | None = plain(
         None,
         "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "
@@ -102,17 +101,9 @@ stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2
 """
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
-(
-    _RANDOM_KEY,
-    _STEP_PERIOD,
-    _MEAN_DELAY_STEPS,
-    _DELAY_JITTER,
-    _DELAY_DISTRIBUTION,
-    _MAX_DELAY_STEPS,
-) = range(6)
-_BAD_STATE_SHARE, _BAD_STATE_PERSISTENCE, _BAD_STATE_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = (
-    range(6, 11)
-)
+_RANDOM_KEY, _STEP_PERIOD, _MEAN_DELAY_STEPS, _DELAY_JITTER = range(4)
+_DELAY_DISTRIBUTION, _MAX_DELAY_STEPS, _BAD_STATE_SHARE, _BAD_STATE_PERSISTENCE = range(4, 8)
+_BAD_STATE_LOSS, _DUPLICATE_SHARE, _PACKETS_PER_STEP = range(8, 11)
 _PLAYOUT_STEPS, _IS_REDUNDANT, _NUM_TRANSIT_SLOTS, _SILENCE_POLICY = range(11, 15)
 _MIN_DELAY_STEPS, _DELAY_TRACE_START = 15, 16
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
@@ -126,7 +117,7 @@ def network_parameters(
     period: float,
     least: int = 0,
     delays: NDArray[np.int64] | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the parameters of one direction for `send_packet` and `receive_packet`.
 
     Args:
@@ -182,7 +173,7 @@ def longest_delay(config: NetworkConfig) -> float:
     return max(longest, config.playout)
 
 
-def _read_delay_trace(path: Path, period: float) -> NDArray[np.float64]:
+def _read_delay_trace(path: Path, period: float) -> Array:
     """Return a trace file's delays (N,) [steps], one packet a period; -1 for a lost packet."""
     # The table reader starts slowly and is needed only for a trace.
     from drake_teleop.logs.read.table_files import read_table
@@ -255,9 +246,7 @@ def _draw_loss_and_delays(p, k, bad):
     return bad, first, second
 
 
-def initial_network_state(
-    p: NDArray[np.float64], neutral: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def initial_network_state(p: Array, neutral: Array) -> tuple[Array, Array]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
     `p` contains the network's parameters, `neutral` (N,) the values at the receiver before the

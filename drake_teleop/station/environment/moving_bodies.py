@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from math import cos, sin
 
 import numpy as np
-from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -36,15 +35,8 @@ from drake_teleop.common.vectors import (
 )
 
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
-(
-    _PARENT_ROW_COLUMN,
-    _JOINT_TYPE_COLUMN,
-    _POSITION_INDEX_COLUMN,
-    _VELOCITY_INDEX_COLUMN,
-    _AXIS_COLUMN,
-    _X_PF_COLUMN,
-    _X_MB_COLUMN,
-) = 0, 1, 2, 3, 4, 7, 14
+_PARENT_ROW_COLUMN, _JOINT_TYPE_COLUMN, _POSITION_INDEX_COLUMN, _VELOCITY_INDEX_COLUMN = range(4)
+_AXIS_COLUMN, _X_PF_COLUMN, _X_MB_COLUMN = 4, 7, 14
 #: Number of columns of the table of joints.
 NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
@@ -88,16 +80,8 @@ def _joint_table_row(plant: MultibodyPlant, context: Context, joint: Joint, row:
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _joint_type_and_axis(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
-    return np.array(
-        [
-            row,
-            kind,
-            *places,
-            *axis,
-            *_pose_as_quaternion_and_position(X_PF),
-            *_pose_as_quaternion_and_position(X_MB),
-        ]
-    )
+    poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
+    return np.array([row, kind, *places, *axis, *poses[0], *poses[1]])
 
 
 def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
@@ -106,10 +90,6 @@ def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, PrismaticJoint):
         return _PRISMATIC_JOINT, joint.translation_axis()
     return _FREE_JOINT if isinstance(joint, QuaternionFloatingJoint) else _FIXED_JOINT, np.zeros(3)
-
-
-def _pose_as_quaternion_and_position(X: RigidTransform) -> Array:
-    return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
 
 
 @njit(cache=True)
@@ -131,12 +111,8 @@ def poses_and_twists_into(joints, state, out):
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
         turn = quaternion_product(turn, quaternion_at(row, _X_PF_COLUMN))
         # From F to M.
-        q, v, kind, axis = (
-            int(row[_POSITION_INDEX_COLUMN]),
-            int(row[_VELOCITY_INDEX_COLUMN]),
-            row[_JOINT_TYPE_COLUMN],
-            vector_at(row, _AXIS_COLUMN),
-        )
+        q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])
+        kind, axis = row[_JOINT_TYPE_COLUMN], vector_at(row, _AXIS_COLUMN)
         if kind == _REVOLUTE_JOINT:
             spin = plus(spin, scale_vector(state[v], rotate_vector(turn, axis)))
             half = 0.5 * state[q]
@@ -185,11 +161,9 @@ def interpolate_joint_state(joints, h, u, start, end, out):
     `start` and `end` are the plant's states at both ends, `joints` is from `MakeJointTable`.
     """
     for k in range(joints.shape[0]):
-        q, v, kind = (
-            int(joints[k, _POSITION_INDEX_COLUMN]),
-            int(joints[k, _VELOCITY_INDEX_COLUMN]),
-            joints[k, _JOINT_TYPE_COLUMN],
-        )
+        row = joints[k]
+        q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])
+        kind = row[_JOINT_TYPE_COLUMN]
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
             out[q], out[v] = _interpolate_hermite(h, u, start[q], start[v], end[q], end[v])
         elif kind == _FREE_JOINT:
@@ -198,10 +172,8 @@ def interpolate_joint_state(joints, h, u, start, end, out):
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
             a, b = quaternion_at(start, q), quaternion_at(end, q)
-            a_dot, b_dot = (
-                _quaternion_rate(vector_at(start, v), a),
-                _quaternion_rate(vector_at(end, v), b),
-            )
+            a_dot = _quaternion_rate(vector_at(start, v), a)
+            b_dot = _quaternion_rate(vector_at(end, v), b)
             w, w_dot = _interpolate_hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
             x, x_dot = _interpolate_hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
             y, y_dot = _interpolate_hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])

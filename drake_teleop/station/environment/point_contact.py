@@ -160,23 +160,16 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
 
 
 def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    for shape in (ball, box):
-        if not all(
-            shape.HasProperty("material", name)
-            for name in (_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY)
-        ):
-            raise DrakeTeleopError(
-                "the contact material has no stiffness or no dissipation",
-                where="drake:proximity_properties",
-                remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
-            )
-    k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS_PROPERTY)) for shape in (ball, box))
-    d_1, d_2 = (
-        float(shape.GetProperty("material", _DISSIPATION_PROPERTY)) for shape in (ball, box)
+    names = (_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY)
+    if not all(shape.HasProperty("material", name) for shape in (ball, box) for name in names):
+        what = "the contact material has no stiffness or no dissipation"
+        remedy = "give drake:point_contact_stiffness and drake:hunt_crossley_dissipation"
+        raise DrakeTeleopError(what, where="drake:proximity_properties", remedy=remedy)
+    (k_1, k_2), (d_1, d_2), frictions = (
+        [shape.GetProperty("material", name) for shape in (ball, box)]
+        for name in (*names, "coulomb_friction")
     )
-    both = CalcContactFrictionFromSurfaceProperties(
-        *(shape.GetProperty("material", "coulomb_friction") for shape in (ball, box))
-    )
+    both = CalcContactFrictionFromSurfaceProperties(*frictions)
     d = (k_2 * d_1 + k_1 * d_2) / (k_1 + k_2)
     return [k_1 * k_2 / (k_1 + k_2), d, both.static_friction(), both.dynamic_friction()]
 

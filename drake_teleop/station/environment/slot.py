@@ -37,12 +37,8 @@ _PEG_BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 class Slot(Environment):
     """Settings of the slot: pose, shape, and contact with the balls of the peg."""
 
-    position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
-    )
-    yaw: float = quantity(
-        0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: it runs along x_W"
-    )
+    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of its mouth")
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: along x_W")
     clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
     depth: float = quantity(0.040, "m", 0.02, 0.05, "from the mouth to the floor")
     chamfer: float = quantity(

@@ -39,25 +39,13 @@ class Surface(Environment):
     """
 
     stiffness: float = quantity(
-        1e4,
-        "N/m",
-        1e2,
-        1e7,
-        "stiffness of its surface, in series with that of the other object (E)",
+        1e4, "N/m", 1e2, 1e7, "stiffness of its surface, in series with that of the other body (E)"
     )
     dissipation: float = quantity(
-        1.0,
-        "s/m",
-        0.0,
-        100.0,
-        "Hunt-Crossley dissipation d of its surface: damping k x d at depth x (E)",
+        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation d: damping k x d at depth x (E)"
     )
     friction: float = quantity(
-        0.2,
-        "1",
-        0.0,
-        2.0,
-        "friction coefficient of its surface; its mean with that of the tool applies (E)",
+        0.2, "1", 0.0, 2.0, "friction of its surface; its mean with that of the tool applies (E)"
     )
 
     @property
@@ -73,12 +61,8 @@ class Surface(Environment):
 class Box(Surface):
     """Fixed box with pose, size and surface."""
 
-    position: list[float] = quantity(
-        [0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, the middle of the box, in W"
-    )
-    rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of R_WBox"
-    )
+    position: list[float] = quantity([0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, its middle, in W")
+    rotation: list[float] = quantity([0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W")
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -103,23 +87,15 @@ def AddFixedBox(
 class Wall(Surface):
     """Fixed flat wall with position, normal, size and surface."""
 
-    position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
-    )
-    normal: list[float] = quantity(
-        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
-    )
-    size: list[float] = quantity(
-        [0.4, 0.4], "m", 1e-3, 4.0, "lengths of its face; the wall is 0.1 m thick"
-    )
+    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
+    normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
+    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "edges of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
-            raise DrakeTeleopError(
-                "is the zero vector, which has no direction",
-                where=f"{where}.normal",
-                remedy="point it to where the tool comes from, such as [0, 0, 1]",
-            )
+            what = "is the zero vector, which has no direction"
+            remedy = "point it to where the tool comes from, such as [0, 0, 1]"
+            raise DrakeTeleopError(what, where=f"{where}.normal", remedy=remedy)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
@@ -145,11 +121,9 @@ class Block(Surface):
 
     def check(self, where: str) -> None:
         if 0.0 < min(self.table) < max(self.size[:2]):
-            raise DrakeTeleopError(
-                "the table is smaller than the block on it",
-                where=f"{where}.table",
-                remedy="give a larger one, or [0, 0] for none, and a !Box to stand on",
-            )
+            what = "the table is smaller than the block on it"
+            remedy = "give a larger one, or [0, 0] for none, and a !Box to stand on"
+            raise DrakeTeleopError(what, where=f"{where}.table", remedy=remedy)
 
     @property
     def floor_stand(self) -> FloorStand | None:

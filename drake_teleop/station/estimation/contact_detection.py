@@ -34,30 +34,20 @@ class ContactDetectionConfig:
 
     statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        THRESHOLD_OVER_MAX,
-        "1",
-        1.0,
-        10.0,
-        "threshold over the largest value in the identification's motion",
+        THRESHOLD_OVER_MAX, "1", 1.0, 10.0, "threshold over the largest value during identification"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
-    drift_time: float = quantity(
-        5.0, "s", 0.5, 1e4, "time constant of the offset tracking without contact"
-    )
+    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the offset in free motion")
     recovery: float = quantity(
-        5e-3, "s", 0.0, 1.0, "recovery time of the sensor's low-pass after a saturation"
+        5e-3, "s", 0.0, 1.0, "recovery time of the low-pass after a saturation"
     )
 
 
 @njit(cache=True)
 def _contact_flag_with_arm(memory, sample, estimate, arm, settings):
     acceleration = np.empty(3)
-    sensor_acceleration_into(
-        arm,
-        sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX],
-        sample[SAMPLE_SPECIFIC_FORCE],
-        acceleration,
-    )
+    q = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]
+    sensor_acceleration_into(arm, q, sample[SAMPLE_SPECIFIC_FORCE], acceleration)
     return update_flag(memory, sample, estimate, acceleration, settings)
 
 
@@ -70,11 +60,8 @@ def update_flag(memory, sample, estimate, acceleration, settings):
     if not (all_in_range(sample) and all_in_range(estimate)):
         return memory[FLAG_INDEX] != 0.0
     contact = np.empty(6)
-    s, omega, alpha = (
-        sample[SAMPLE_SPECIFIC_FORCE],
-        sample[SAMPLE_ANGULAR_VELOCITY],
-        sample[SAMPLE_ANGULAR_ACCELERATION],
-    )
+    s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
+    alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
     wrench, offset, phi = sample[SAMPLE_WRENCH], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
     return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)

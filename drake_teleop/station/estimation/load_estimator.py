@@ -38,25 +38,13 @@ class LoadEstimatorConfig:
         "update with every sample; only for free motion: a contact wrench would count as load",
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
-    method: str = choice(
-        "rls", (), "recursive least squares, or total: allows for noisy accelerations", METHODS
-    )
+    method: str = choice("rls", (), "least squares, or total: for noisy accelerations", METHODS)
     settled_bound: float = quantity(
-        0.05,
-        "1",
-        1e-6,
-        10.0,
-        "predicted uncertainty of a settled load, relative to a natural value",
+        0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
     )
-    watch: bool = plain(
-        False, "freeze a settled load, or one that is given with its covariance; detect its change"
-    )
+    watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
     model_error: float = quantity(
-        0.0,
-        "1",
-        0.0,
-        0.5,
-        "watch: error of the wrench by gains, cross-talk and delays, as a share of it",
+        0.0, "1", 0.0, 0.5, "watch: error of the wrench by gains, cross-talk and delays, as a share"
     )
 
     def check(self, where: str) -> None:
@@ -105,11 +93,9 @@ class LoadEstimator(LeafSystem):
     ) -> None:
         super().__init__()
         if config.watch and not config.enabled and covariance is None:
-            raise DrakeTeleopError(
-                "there is no load to monitor: none is estimated or given with a covariance",
-                where="load_estimator.watch",
-                remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
-            )
+            what = "there is no load to monitor: none is estimated or given with a covariance"
+            remedy = "set load_estimator.enabled, or pass load_estimate with load_covariance"
+            raise DrakeTeleopError(what, where="load_estimator.watch", remedy=remedy)
         self._estimator = METHODS[config.method].for_noise(
             noise_std, motion_std, forgetting=config.forgetting, bound=config.settled_bound
         )
@@ -155,11 +141,7 @@ class LoadEstimator(LeafSystem):
             )
 
     def _update_estimate(
-        self,
-        estimate: Array,
-        sample: Array,
-        discrete_state: DiscreteValues,
-        time: float,
+        self, estimate: Array, sample: Array, discrete_state: DiscreteValues, time: float
     ) -> None:
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)

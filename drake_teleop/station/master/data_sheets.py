@@ -3,32 +3,16 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.registry import Registry
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HALF_WORKSPACE_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    INERTIA_SLOT,
-    IS_IN_TASK_SPACE_SLOT,
-    MASS_SLOT,
-    MAX_ROTATION_SLOTS,
-    NUM_DEVICE_PARAMETERS,
-    PEAK_FORCE_SLOT,
-    PEAK_TORQUE_SLOTS,
-    WORKSPACE_CENTRE_SLOTS,
-)
+from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
@@ -66,30 +50,16 @@ class DeviceFigures:
     peak_torque: list[float] = quantity(
         [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: measured only"
     )
-    size: list[float] = quantity(
-        [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "size of the workspace along x, y, z"
-    )
+    size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
-        [0.27, 0.0, 0.03],
-        "m",
-        -2.0,
-        2.0,
-        "centre of the workspace, p_B; default: start of the scenarios",
+        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
     )
     turn: list[float] = quantity(
-        [1.2, 1.2, 2.4],
-        "rad",
-        0.0,
-        math.pi,
-        "largest yaw, pitch (up to 1.5) and roll, in both directions",
+        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (to 1.5), roll; both directions"
     )
     resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
-    turn_resolution: float = quantity(
-        0.0, "rad", 0.0, 0.1, "rotation step of the encoders; 0: exact"
-    )
-    rate_hz: float = quantity(
-        0.0, "Hz", 0.0, 1e5, "update rate of the device; 0 or a larger rate: rates.hand_hz"
-    )
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
+    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or a larger one: rates.hand_hz")
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
@@ -152,25 +122,26 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
-        parameters = np.zeros(NUM_DEVICE_PARAMETERS)
-        parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
+        hand = hand_mass, hand_inertia
         if self.model == PHANTOM_NAME:
-            parameters[DRY_FRICTION_SLOTS] = self.friction.coulomb
-            parameters[DAMPING_SLOTS] = self.friction.viscous
-            parameters[PEAK_FORCE_SLOT] = PEAK_FORCE_N
-            parameters[PEAK_TORQUE_SLOTS] = PEAK_WRIST_TORQUES_N_M
-            return HapticDevice(parameters, self.model)
-        figures = self._data_sheet()
-        parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
-        parameters[DRY_FRICTION_SLOTS] = np.repeat([figures.friction, figures.friction_torque], 3)
-        parameters[DAMPING_SLOTS] = np.repeat([figures.damping, figures.turning_damping], 3)
-        parameters[PEAK_FORCE_SLOT] = figures.peak_force
-        parameters[PEAK_TORQUE_SLOTS] = figures.peak_torque
-        parameters[MASS_SLOT], parameters[INERTIA_SLOT] = figures.apparent_mass, figures.inertia
-        parameters[WORKSPACE_CENTRE_SLOTS] = figures.centre
-        parameters[HALF_WORKSPACE_SLOTS] = 0.5 * np.array(figures.size)
-        parameters[MAX_ROTATION_SLOTS] = figures.turn
-        return HapticDevice(parameters, self.model)
+            peaks = PEAK_FORCE_N, PEAK_WRIST_TORQUES_N_M
+            resistance = self.friction.coulomb, self.friction.viscous
+            parameters = DeviceParameters(*hand, *peaks, *resistance, in_task_space=False)
+        else:
+            figures = self._data_sheet()
+            parameters = DeviceParameters(
+                *hand,
+                figures.peak_force,
+                figures.peak_torque,
+                np.repeat([figures.friction, figures.friction_torque], 3),
+                np.repeat([figures.damping, figures.turning_damping], 3),
+                mass=figures.apparent_mass,
+                inertia=figures.inertia,
+                workspace_centre=figures.centre,
+                half_workspace=0.5 * np.array(figures.size),
+                max_rotation=figures.turn,
+            )
+        return HapticDevice(as_compiled_arguments(parameters), self.model)
 
     @property
     def is_joint_leader(self) -> bool:
@@ -204,51 +175,32 @@ class Master:
             return dataclasses.replace(self, friction=friction)
         if self.leader is not None:
             return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
-        figures = dataclasses.replace(
-            self._data_sheet(),
-            friction=0.0,
-            friction_torque=0.0,
-            resolution=0.0,
-            turn_resolution=0.0,
-        )
+        names = ("friction", "friction_torque", "resolution", "turn_resolution")
+        exact: Any = dict.fromkeys(names, 0.0)
+        figures = dataclasses.replace(self._data_sheet(), **exact)
         return dataclasses.replace(self, figures=figures)
-
-    def with_absolute_paths(self, folder: Path) -> "Master":
-        """Return a copy with paths resolved from the scenario's folder."""
-        if self.leader is None:
-            return self
-        return dataclasses.replace(self, leader=self.leader.with_absolute_paths(folder))
 
     def _data_sheet(self) -> DeviceFigures:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
         if self.model == PHANTOM_NAME and self.figures is not None:
-            raise DrakeTeleopError(
-                "the Phantom has fixed dynamics and accepts no data sheet",
-                where=f"{where}.figures",
-                remedy="leave them out, or choose another model, such as custom",
-            )
+            what = "the Phantom has fixed dynamics and accepts no data sheet"
+            remedy = "leave them out, or choose another model, such as custom"
+            raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
         if self.model != PHANTOM_NAME and self.friction != JointFriction():
-            raise DrakeTeleopError(
-                f"only the Phantom accepts joint friction, not model '{self.model}'",
-                where=f"{where}.friction",
-                remedy="leave it out, and set figures.friction and figures.damping",
-            )
+            what = f"only the Phantom accepts joint friction, not model '{self.model}'"
+            remedy = "leave it out, and set figures.friction and figures.damping"
+            raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)
         if (self.leader is None) == (self.model == LEADER_NAME):
-            raise DrakeTeleopError(
-                "`model: leader` and the settings `leader` require each other",
-                where=f"{where}.leader",
-                remedy="give both, with leader.file and leader.hand_frame, or none",
-            )
+            what = "`model: leader` and the settings `leader` require each other"
+            remedy = "give both, with leader.file and leader.hand_frame, or none"
+            raise DrakeTeleopError(what, where=f"{where}.leader", remedy=remedy)
         if self.leader is not None:
             self.leader.check(f"{where}.leader")
             if self.figures is not None:
-                raise DrakeTeleopError(
-                    "the dynamics of a leader arm are from its model file, not a data sheet",
-                    where=f"{where}.figures",
-                    remedy="leave them out",
-                )
+                what = "the dynamics of a leader arm are from its model file, not a data sheet"
+                raise DrakeTeleopError(what, where=f"{where}.figures", remedy="leave them out")
         if self.figures is not None and self.figures.turn[1] > _MAX_DEVICE_PITCH_RAD:
             raise DrakeTeleopError(
                 f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
@@ -259,7 +211,3 @@ class Master:
 
 
 _MAX_DEVICE_PITCH_RAD = 1.5  # rad
-
-
-def data_sheet_in_settings(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

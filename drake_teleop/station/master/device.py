@@ -77,10 +77,7 @@ class MasterDevice(DeviceBlock):
 
 
 def AddHapticDevice(
-    builder: DiagramBuilder,
-    period: float,
-    device: HapticDevice | LeaderDevice,
-    q_initial: Array,
+    builder: DiagramBuilder, period: float, device: HapticDevice | LeaderDevice, q_initial: Array
 ) -> tuple[LeafSystem, LeafSystem]:
     check_device_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):

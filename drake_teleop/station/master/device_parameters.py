@@ -1,27 +1,24 @@
-"""Parameters of a haptic device in one vector for compiled code, and its end stops."""
+"""Parameters of a haptic device for compiled code, and its end stops."""
 
 from __future__ import annotations
 
-from drake_teleop.common.compiled import njit
-from drake_teleop.station.passivity.memory import SlotAllocator
+from collections import namedtuple
 
-NUM_DEVICE_PARAMETERS = 31  #: length of the vector
-_layout = SlotAllocator(NUM_DEVICE_PARAMETERS)
-HAND_MASS_SLOT = _layout.number()  #: mass of the hand on the grip [kg]
-HAND_INERTIA_SLOT = _layout.number()  #: inertia of the hand about every axis through E [kg m^2]
-DRY_FRICTION_SLOTS = _layout.vector(6)  #: Coulomb friction of the device's axes [N or N m]
-DAMPING_SLOTS = _layout.vector(6)  #: damping of these axes [N s/m or N m s/rad]
-PEAK_FORCE_SLOT = _layout.number()  #: largest displayed force [N]
-PEAK_TORQUE_SLOTS = _layout.vector(
-    3
-)  #: largest torque about the three rotational axes [N m]; 0: none
-IS_IN_TASK_SPACE_SLOT = _layout.number()  #: 1 for a device of `task_space`, 0 for the Phantom
-# Only for a device in task space:
-MASS_SLOT = _layout.number()  #: apparent mass at the grip [kg]
-INERTIA_SLOT = _layout.number()  #: apparent inertia at the grip about every axis [kg m^2]
-WORKSPACE_CENTRE_SLOTS = _layout.vector(3)  #: centre of the workspace, p_B [m]
-HALF_WORKSPACE_SLOTS = _layout.vector(3)  #: half edges of the workspace [m]
-MAX_ROTATION_SLOTS = _layout.vector(3)  #: largest yaw, pitch and roll [rad]
+import numpy as np
+
+from drake_teleop.common.compiled import njit
+
+#: Parameters of a haptic device for compiled code: mass [kg] of the hand, its inertia about every
+#: axis through E [kg m^2]; largest force [N] and torques (3,) about the rotational axes [N m], 0:
+#: none; Coulomb friction (6,) and damping (6,) of the axes. Then, for a device in `task_space`
+#: only: apparent mass and inertia at the grip, centre p_B (3,) and half edges (3,) of the workspace
+#: [m], largest yaw, pitch and roll (3,) [rad].
+DeviceParameters = namedtuple(
+    "DeviceParameters",
+    "hand_mass hand_inertia peak_force peak_torque dry_friction damping in_task_space"
+    " mass inertia workspace_centre half_workspace max_rotation",
+    defaults=(np.zeros(6), np.zeros(6), True, 0.0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3)),
+)
 
 
 @njit(cache=True)

@@ -11,21 +11,13 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    IS_IN_TASK_SPACE_SLOT,
-    PEAK_FORCE_SLOT,
-    PEAK_TORQUE_SLOTS,
-)
+from drake_teleop.station.master.device_parameters import DeviceParameters
 
 
 @njit(cache=True)
 def jacobian_into(q, device, J):
     """Write the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B, into J."""
-    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
+    if device.in_task_space:
         task_space.jacobian_into(q, J)
     else:
         phantom.jacobian_into(q, J)
@@ -34,7 +26,7 @@ def jacobian_into(q, device, J):
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
     """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
-    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
+    if device.in_task_space:
         out[:6] = 0.0
     else:
         phantom.gravity_torque_into(q, out)
@@ -43,7 +35,7 @@ def gravity_torque_into(q, device, out):
 @njit(cache=True)
 def pose_into(q, device, pose):
     """Write the stylus pose X_BE (7,) at the joint positions q (6,) into `pose`."""
-    if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
+    if device.in_task_space:
         task_space.pose_into(q, pose)
     else:
         phantom.pose_into(q, pose)
@@ -71,7 +63,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     total[:] = 0.0
     for i in range(4):
         copy_into(slope, 0, stage, 6, 6)
-        if device[IS_IN_TASK_SPACE_SLOT] != 0.0:
+        if device.in_task_space:
             task_space.joint_acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
             )
@@ -89,19 +81,19 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
 
 
 class HapticDeviceBase:
-    """Base class of haptic devices; `parameters` are the parameters of `device_parameters`."""
+    """Base class of haptic devices."""
 
-    parameters: Array
+    parameters: DeviceParameters
 
     @property
     def peak_force(self) -> float:
         """Largest displayed force [N]; some postures of a leader arm allow less."""
-        return float(self.parameters[PEAK_FORCE_SLOT])
+        return self.parameters.peak_force
 
     @property
     def peak_torque(self) -> Array:
         """Largest displayed torques (3,) about the rotational axes [N m]."""
-        return self.parameters[PEAK_TORQUE_SLOTS]
+        return self.parameters.peak_torque
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,7 @@ class HapticDevice(HapticDeviceBase):
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """
 
-    parameters: Array
+    parameters: DeviceParameters
     name: str = "phantom_premium_15"
 
     num_joints = 6
@@ -125,7 +117,7 @@ class HapticDevice(HapticDeviceBase):
 
     @property
     def is_phantom(self) -> bool:
-        return not self.parameters[IS_IN_TASK_SPACE_SLOT]
+        return not self.parameters.in_task_space
 
     def inverse_kinematics(self, pose: Array) -> Array:
         """Return the joint positions (6,) for a stylus pose X_BE (7,)."""
@@ -160,7 +152,7 @@ class HapticDevice(HapticDeviceBase):
         """Return the mass matrix (6, 6), including the hand."""
         J, M, device = self.jacobian(q), np.empty((6, 6)), self.parameters
         if self.is_phantom:
-            phantom.mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
+            phantom.mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
         else:
             task_space.mass_matrix_into(q, J, device, M)
         return M
@@ -171,6 +163,6 @@ class HapticDevice(HapticDeviceBase):
         With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
-            slope = creeping * self.parameters[DRY_FRICTION_SLOTS] / phantom.FRICTION_TANH_RAD_S
-            return np.diag(slope + self.parameters[DAMPING_SLOTS])
+            slope = creeping * self.parameters.dry_friction / phantom.FRICTION_TANH_RAD_S
+            return np.diag(slope + self.parameters.damping)
         return task_space.damping_matrix(q, self.parameters, creeping)

@@ -13,7 +13,7 @@ from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callb
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.master.device_parameters import PEAK_FORCE_SLOT, PEAK_TORQUE_SLOTS
+from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.dynamics import (
     HapticDeviceBase,
     gravity_torque_into,
@@ -45,10 +45,10 @@ _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
 
 @njit(cache=True)
 def _peak_wrench_of_device(parameters):
-    return np.array([parameters[PEAK_FORCE_SLOT], parameters[PEAK_TORQUE_SLOTS].max()])
+    return np.array([parameters.peak_force, parameters.peak_torque.max()])
 
 
-def initial_display_state(q: Array, parameters: Array) -> Array:
+def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
     display = np.zeros(_MONITOR_SLOTS.stop)
     display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
     display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
@@ -64,10 +64,10 @@ def limit_wrench_into(wrench, parameters, J, displayed):
             return
     # hypot does not overflow.
     force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
-    scale = 1.0 if force <= parameters[PEAK_FORCE_SLOT] else parameters[PEAK_FORCE_SLOT] / force
+    scale = 1.0 if force <= parameters.peak_force else parameters.peak_force / force
     for k in range(3):
         displayed[k] = scale * wrench[k]
-    scale, peak = 1.0, parameters[PEAK_TORQUE_SLOTS]
+    scale, peak = 1.0, parameters.peak_torque
     for i in range(3):
         motor = abs(J[3, 3 + i] * wrench[3] + J[4, 3 + i] * wrench[4] + J[5, 3 + i] * wrench[5])
         if motor * scale > peak[i]:
@@ -164,16 +164,9 @@ class DeviceBlock(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
 
     def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
-        self._advance(
-            *self._constants,
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(2),
-            discrete_state.get_mutable_value(3),
-            self._hand_wrench.Eval(context),
-            self._drive.Eval(context),
-            self._period,
-        )
+        states = [discrete_state.get_mutable_value(group) for group in range(4)]
+        inputs = self._hand_wrench.Eval(context), self._drive.Eval(context)
+        self._advance(*self._constants, *states, *inputs, self._period)
 
 
 class ForceDisplay(LeafSystem):
@@ -220,14 +213,9 @@ class ForceDisplay(LeafSystem):
         return wrench
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
-        step_display(
-            self._wrench_to_display(context),
-            self._device.Eval(context),
-            self._parameters,
-            self._period,
-            self._jacobian,
-            output.get_mutable_value(),
-        )
+        inputs = self._wrench_to_display(context), self._device.Eval(context)
+        constants = self._parameters, self._period, self._jacobian
+        step_display(*inputs, *constants, output.get_mutable_value())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])

@@ -17,7 +17,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
-from drake_teleop.station.master.device_parameters import HAND_MASS_SLOT, end_stop_force
+from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.slave.arm import (
@@ -35,16 +35,8 @@ from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 
 # Rows of `LeaderDevice.joint_table`.
-(
-    _COULOMB_ROW,
-    _DAMPING_ROW,
-    _MIN_Q_ROW,
-    _MAX_Q_ROW,
-    _STOP_STIFFNESS_ROW,
-    _STOP_DAMPING_ROW,
-    _TORQUE_LIMIT_ROW,
-    _CARRIED_WEIGHT_SHARE_ROW,
-) = range(8)
+_COULOMB_ROW, _DAMPING_ROW, _MIN_Q_ROW, _MAX_Q_ROW, _STOP_STIFFNESS_ROW = range(5)
+_STOP_DAMPING_ROW, _TORQUE_LIMIT_ROW, _CARRIED_WEIGHT_SHARE_ROW = range(5, 8)
 # Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED): a slower joint creeps.
 FRICTION_TANH_SPEED = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
@@ -177,14 +169,14 @@ class LeaderDevice(HapticDeviceBase):
             lower and upper limits [rad], stiffness and damping of end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        parameters: (NUM_DEVICE_PARAMETERS,) parameters for the force display.
+        parameters: parameters for the force display.
     """
 
     arm: ArmModel
     arm_without_hand: ArmModel
     joint_table: Array
     home: Array
-    parameters: Array
+    parameters: DeviceParameters
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
@@ -280,7 +272,7 @@ class LeaderArm(DeviceBlock):
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
         gravity = np.linalg.norm(device.arm.table[-1, LAST_ROW_GRAVITY_COLUMN:][:3])
-        hand_weight = float(device.parameters[HAND_MASS_SLOT] * gravity)
+        hand_weight = float(device.parameters.hand_mass * gravity)
         constants = (*device.compiled_constants, hand_weight)
         super().__init__(period, device, q_initial, step_leader, constants)
 

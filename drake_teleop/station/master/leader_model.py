@@ -11,15 +11,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array
-from drake_teleop.station.master.device_parameters import (
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    IS_IN_TASK_SPACE_SLOT,
-    NUM_DEVICE_PARAMETERS,
-    PEAK_FORCE_SLOT,
-    PEAK_TORQUE_SLOTS,
-)
+from drake_teleop.common.numeric import Array, as_compiled_arguments
+from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.leader import LeaderDevice, make_joint_table
 from drake_teleop.station.slave.arm import (
     PHI_COLUMN,
@@ -29,7 +22,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
     forward_kinematics,
 )
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, values_per_joint
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
@@ -41,35 +34,31 @@ JOINT_MODE = "joints"
 class Leader:
     """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
-    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml file, from the scenario's folder")
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder", is_path=True)
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses in it, from the scenario's folder"
+        [], "folders for package:// addresses in it, from the scenario's folder", is_path=True
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
-    home: list[float] = plain(
-        [], "joint positions at the start [rad, m]; by default 0, or the middle of their limits"
-    )
+    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start; default: 0 or middle of limits")
     base_rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
     )
-    weight_carried: float = quantity(
-        1.0, "1", 0.0, 1.0, "share of the arm's weight compensated by motors or springs"
+    weight_carried: float = quantity(1.0, "1", 0.0, 1.0, "compensated share of the arm's weight")
+    friction: list[float] = quantity(
+        [], "N m", 0.0, 1e6, "Coulomb friction of the joints, one for all or each; by default none"
     )
-    friction: list[float] = plain(
-        [], "Coulomb friction of the joints [N m], one for all or each; by default none"
+    damping: list[float] = quantity(
+        [], "N m s/rad", 0.0, 1e6, "damping in addition to the model's, one for all or each joint"
     )
-    damping: list[float] = plain(
-        [], "joint damping [N m s/rad] in addition to the model's, one for all or each"
-    )
-    torque_limit: list[float] = plain(
-        [], "motor torque limits [N m], one for all or each; default: the model's"
+    torque_limit: list[float] = quantity(
+        [], "N m", 0.0, 1e6, "motor torque limits, one for all or each; default: the model's"
     )
     peak_force: float = quantity(30.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "largest displayed torque about each axis")
     leads: str = choice(
         "pose",
         ("pose", JOINT_MODE),
-        "pose: commands X_WS; joints: each joint commands that of a slave with equal kinematics",
+        "pose: X_WS; joints: each joint commands that of an equal slave",
     )
 
     def check(self, where: str) -> None:
@@ -77,23 +66,6 @@ class Leader:
             if not getattr(self, name):
                 what = f"a leader arm requires a {name.replace('_', ' ')}"
                 raise DrakeTeleopError(what, where=f"{where}.{name}", remedy="set this field")
-        for name in ("home", "friction", "damping", "torque_limit"):
-            values = getattr(self, name)
-            if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
-                least, fault = ("", "") if name == "home" else (" of 0 or more", "negative or ")
-                raise DrakeTeleopError(
-                    f"{values} contains a number that is {fault}not finite",
-                    where=f"{where}.{name}",
-                    remedy=f"give finite numbers{least}",
-                )
-
-    def with_absolute_paths(self, folder: Path) -> "Leader":
-        """Return a copy with paths resolved from the scenario's folder."""
-        return dataclasses.replace(
-            self,
-            file=str((folder / self.file).resolve()) if self.file else "",
-            package_paths=[str((folder / path).resolve()) for path in self.package_paths],
-        )
 
     def add_to_plant(
         self, plant: MultibodyPlant, X_Table: RigidTransform | None = None
@@ -121,33 +93,20 @@ class Leader:
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
         held = arm_without_hand.with_load(phi)
-        coulomb, viscous = (
-            self._setting_per_joint(name, arm, 0.0) for name in ("friction", "damping")
-        )
-        limit = self._setting_per_joint("torque_limit", arm, arm.effort_limit)
+        coulomb = values_per_joint(arm, self.friction, "master.leader.friction", 0.0)
+        viscous = values_per_joint(arm, self.damping, "master.leader.damping", 0.0)
+        limits = self.torque_limit, "master.leader.torque_limit", arm.effort_limit
+        limit = values_per_joint(arm, *limits)
         joint_table = make_joint_table(held, home, coulomb, viscous, limit, self.weight_carried)
-        parameters = np.zeros(NUM_DEVICE_PARAMETERS)
-        parameters[HAND_MASS_SLOT], parameters[HAND_INERTIA_SLOT] = hand_mass, hand_inertia
-        parameters[PEAK_FORCE_SLOT] = self.peak_force
-        parameters[PEAK_TORQUE_SLOTS] = self.peak_torque
-        parameters[IS_IN_TASK_SPACE_SLOT] = 1.0
+        peak = self.peak_force, np.full(3, self.peak_torque)
+        parameters = as_compiled_arguments(DeviceParameters(hand_mass, hand_inertia, *peak))
         return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
 
     def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._setting_per_joint("home", arm, 0.0)
+            return values_per_joint(arm, self.home, "master.leader.home")
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, arm.middle_positions)
-
-    def _setting_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        values, n = getattr(self, name), arm.num_joints
-        if len(values) not in ((n,) if name == "home" else (0, 1, n)):
-            raise DrakeTeleopError(
-                f"{len(values)} values do not fit a leader arm with {n} joints",
-                where=f"master.leader.{name}",
-                remedy=f"give {n}, for {', '.join(arm.joint_names)}",
-            )
-        return np.broadcast_to(np.array(values if values else otherwise, float), (n,)).copy()
 
 
 def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:

@@ -30,13 +30,7 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    end_stop_force,
-)
+from drake_teleop.station.master.device_parameters import end_stop_force
 
 GRAVITY_M_S2 = 9.81  # m/s^2, along -z_B
 
@@ -204,17 +198,11 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_TANH_RAD_S) + viscous[i] * v[i]
         stiffness = _MAIN_STOP_STIFFNESS_N_M_RAD if i < 3 else _WRIST_STOP_STIFFNESS_N_M_RAD
         damping = _MAIN_STOP_DAMPING_N_M_S_RAD if i < 3 else _WRIST_STOP_DAMPING_N_M_S_RAD
-        torque[i] += end_stop_force(
-            q[i], v[i], JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i], stiffness, damping
-        )
-    five_bar = end_stop_force(
-        q[1] - q[2],
-        v[1] - v[2],
-        FIVE_BAR_RANGE_RAD[0],
-        FIVE_BAR_RANGE_RAD[1],
-        _MAIN_STOP_STIFFNESS_N_M_RAD,
-        _MAIN_STOP_DAMPING_N_M_S_RAD,
-    )
+        lower, upper = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
+        torque[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
+    (lower, upper), angle, rate = FIVE_BAR_RANGE_RAD, q[1] - q[2], v[1] - v[2]
+    stiffness, damping = _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD
+    five_bar = end_stop_force(angle, rate, lower, upper, stiffness, damping)
     torque[1] += five_bar
     torque[2] -= five_bar
 
@@ -227,14 +215,14 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], M)
+    mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
     gravity_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis_torque(q, v, J, device[HAND_MASS_SLOT], device[HAND_INERTIA_SLOT], vdot)
-    _add_friction_and_end_stops(q, v, device[DRY_FRICTION_SLOTS], device[DAMPING_SLOTS], vdot)
+    _subtract_coriolis_torque(q, v, J, device.hand_mass, device.hand_inertia, vdot)
+    _add_friction_and_end_stops(q, v, device.dry_friction, device.damping, vdot)
     solve_by_cholesky(M, vdot, 6)
 
 
@@ -266,11 +254,9 @@ def inverse_kinematics(pose: Array) -> Array:
     # Two-link arm whose second link points along q3 - 90 degrees; elbow = q2 - (q3 - 90 degrees).
     cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
     if abs(cosine) > 1:
-        raise DrakeTeleopError(
-            f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m",
-            where="pose_master",
-            remedy="choose a start pose inside the device's workspace, in its base frame B",
-        )
+        what = f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m"
+        remedy = "choose a start pose inside the device's workspace, in its base frame B"
+        raise DrakeTeleopError(what, where="pose_master", remedy=remedy)
     elbow = math.acos(cosine)
     q2 = math.atan2(z, reach) + math.atan2(L2 * math.sin(elbow), L1 + L2 * math.cos(elbow))
     q3 = q2 - elbow + math.pi / 2

@@ -16,18 +16,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross, plus, scale_vector
-from drake_teleop.station.master.device_parameters import (
-    DAMPING_SLOTS,
-    DRY_FRICTION_SLOTS,
-    HALF_WORKSPACE_SLOTS,
-    HAND_INERTIA_SLOT,
-    HAND_MASS_SLOT,
-    INERTIA_SLOT,
-    MASS_SLOT,
-    MAX_ROTATION_SLOTS,
-    WORKSPACE_CENTRE_SLOTS,
-    end_stop_force,
-)
+from drake_teleop.station.master.device_parameters import DeviceParameters, end_stop_force
 
 # Coulomb friction is proportional to tanh(speed / FRICTION_TANH_M_S): a slower device creeps.
 FRICTION_TANH_M_S, FRICTION_TANH_RAD_S = 0.002, 0.01  # m/s, rad/s, estimate
@@ -49,9 +38,9 @@ def jacobian_into(q, J):
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
     M[:, :] = 0.0
-    inertia = device[INERTIA_SLOT] + device[HAND_INERTIA_SLOT]
+    inertia = device.inertia + device.hand_inertia
     for i in range(3):
-        M[i, i] = device[MASS_SLOT] + device[HAND_MASS_SLOT]
+        M[i, i] = device.mass + device.hand_mass
         for k in range(3):
             for row in range(3, 6):
                 M[3 + i, 3 + k] += inertia * J[row, 3 + i] * J[row, 3 + k]
@@ -69,32 +58,29 @@ def _friction_force_per_speed(motion, coulomb, viscous, speed_of_tanh):
 def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
-    mass = device[MASS_SLOT] + device[HAND_MASS_SLOT]
+    mass = device.mass + device.hand_mass
     drag = _friction_force_per_speed(
-        v[:3], device[DRY_FRICTION_SLOTS.start], device[DAMPING_SLOTS.start], FRICTION_TANH_M_S
+        v[:3], device.dry_friction[0], device.damping[0], FRICTION_TANH_M_S
     )
     for i in range(3):
-        x, half = q[i] - device[WORKSPACE_CENTRE_SLOTS][i], device[HALF_WORKSPACE_SLOTS][i]
+        x, half = q[i] - device.workspace_centre[i], device.half_workspace[i]
         stop = end_stop_force(x, v[i], -half, half, _STOP_STIFFNESS_N_M, _STOP_DAMPING_N_S_M)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
-    inertia = device[INERTIA_SLOT] + device[HAND_INERTIA_SLOT]
+    inertia = device.inertia + device.hand_inertia
     omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
     for k in range(4, 6):
         turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
     drag = _friction_force_per_speed(
-        omega,
-        device[DRY_FRICTION_SLOTS.start + 3],
-        device[DAMPING_SLOTS.start + 3],
-        FRICTION_TANH_RAD_S,
+        omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_RAD_S
     )
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
     for i in range(3):
-        half = device[MAX_ROTATION_SLOTS][i]
+        half = device.max_rotation[i]
         torque[i] = motor[3 + i] + end_stop_force(
             q[3 + i], v[3 + i], -half, half, _STOP_STIFFNESS_N_M_RAD, _STOP_DAMPING_N_M_S_RAD
         )
@@ -123,15 +109,15 @@ def pose_into(q, pose):
         pose[4 + i] = q[i]
 
 
-def damping_matrix(q: Array, device: Array, creeping: bool) -> Array:
+def damping_matrix(q: Array, device: DeviceParameters, creeping: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_TANH_M_S, FRICTION_TANH_RAD_S])
-    drag = device[DAMPING_SLOTS][[0, 3]] + creeping * device[DRY_FRICTION_SLOTS][[0, 3]] / of_tanh
+    drag = device.damping[[0, 3]] + creeping * device.dry_friction[[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
 
-def inverse_kinematics(pose: Array, device: Array) -> Array:
+def inverse_kinematics(pose: Array, device: DeviceParameters) -> Array:
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -139,26 +125,24 @@ def inverse_kinematics(pose: Array, device: Array) -> Array:
     return q
 
 
-def _is_past_end_stop(q: Array, device: Array, margin: float) -> NDArray[np.bool_]:
-    centre = np.append(device[WORKSPACE_CENTRE_SLOTS], np.zeros(3))
-    half = np.append(device[HALF_WORKSPACE_SLOTS], device[MAX_ROTATION_SLOTS])
+def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDArray[np.bool_]:
+    centre = np.append(device.workspace_centre, np.zeros(3))
+    half = np.append(device.half_workspace, device.max_rotation)
     return np.abs(q - centre) > half + margin
 
 
-def is_at_end_stop(q: Array, device: Array) -> NDArray[np.bool_]:
+def is_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
     return (
-        _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION_SLOTS] > 0.0)
+        _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device.max_rotation > 0.0)
     ).any(axis=1)
 
 
-def check_limits(q: Array, device: Array) -> None:
+def check_limits(q: Array, device: DeviceParameters) -> None:
     if _is_past_end_stop(q, device, 1e-9).any():
-        low, high = (
-            device[WORKSPACE_CENTRE_SLOTS] - device[HALF_WORKSPACE_SLOTS],
-            device[WORKSPACE_CENTRE_SLOTS] + device[HALF_WORKSPACE_SLOTS],
-        )
+        centre, half = device.workspace_centre, device.half_workspace
+        low, high = centre - half, centre + half
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
-        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION_SLOTS]))
+        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device.max_rotation))
         raise DrakeTeleopError(
             f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "

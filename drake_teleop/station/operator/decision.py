@@ -5,14 +5,17 @@ The hand moves by planned displacements, and waits until their effect is visible
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import namedtuple
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.station.operator.minimum_jerk import (
     PLAN_SIZE,
     PLAN_START_INDEX,
@@ -38,28 +41,10 @@ from drake_teleop.station.operator.task import (
     Task,
 )
 
-Array = NDArray[np.float64]
-
 DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
-# Indices of a packed task.
-(
-    _TASK_KIND,
-    _TASK_START_TIME,
-    _TASK_TIMEOUT,
-    _GOAL_TRANSLATION,
-    _APPROACH_AXIS,
-    _TARGET_RADIUS,
-    _DWELL_TIME,
-) = 0, 1, 2, 3, 6, 9, 10
-_STANDOFF, _SET_FORCE, _FORCE_TOLERANCE, _SLOT_DEPTH, _PACKED_TASK_SIZE = 11, 12, 13, 14, 15
 _OPERATOR_RANDOM_STREAM = 2  # random stream; the network's lines use others
-# Indices of a packed person: training, movement and perception.
-_TOOL_OVER_HAND_MOTION, _FORCE_GAIN, _VISION_DELAY, _FORCE_DELAY, _RANDOM_KEY = 0, 1, 2, 3, 4
-_PEAK_ACCELERATION, _MIN_MOVE_DURATION, _MOTOR_NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
-_VISION_NOISE, _DEPTH_ERROR = 10, 11
-_AIM_ERROR, _WEBER_FRACTION, _R_WB = 12, 13, 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,57 +66,58 @@ class OperatorTraining:
     seed: int
 
 
+#: Training, perception and movement for compiled code; delays are those of both directions.
+OperatorParameters = namedtuple(
+    "OperatorParameters",
+    "R_WB translation_scale force_gain vision_delay force_delay random_key"
+    " vision_noise depth_error aim_error weber_fraction"
+    " acceleration shortest noise approach_speed gentle_force",
+)
+#: Task for compiled code: times, target in W relative to the tool's start, criteria.
+TaskParameters = namedtuple(
+    "TaskParameters",
+    "kind start_time timeout goal approach_axis radius dwell standoff force tolerance depth",
+    defaults=(0.0, 0.0, 0.0, 0.0),
+)
+
+
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: Movement
-) -> Array:
+) -> OperatorParameters:
     there_and_back = training.forward_delay_s + training.backward_delay_s + _MOVE_EFFECT_DELAY_S
+    delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
     # 53 bits of a key are exact in a float.
-    key = float(random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM))
-    return np.array(
-        [
-            *(training.translation_scale, training.force_gain),
-            *(perception.vision_delay + there_and_back, perception.reaction_time + there_and_back),
-            *(key, movement.acceleration, movement.shortest, movement.noise),
-            *(movement.approach_speed, movement.gentle_force),
-            *(perception.vision_noise, perception.depth_error, perception.aim_error),
-            perception.weber_fraction,
-            *training.R_WB.ravel(),
-        ]
-    )
+    key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM)
+    own = training.R_WB, training.translation_scale, training.force_gain, *delays, key
+    errors = ("vision_noise", "depth_error", "aim_error", "weber_fraction")
+    vision = [getattr(perception, name) for name in errors]
+    return as_compiled_arguments(OperatorParameters(*own, *vision, **dataclasses.asdict(movement)))
 
 
-def pack_task_parameters(task: Task) -> Array:
-    packed = np.zeros(_PACKED_TASK_SIZE)
-    packed[_TASK_KIND] = TASK_CLASSES.index(type(task))
-    packed[[_TASK_START_TIME, _TASK_TIMEOUT]] = task.t_start, task.timeout
-    packed[_GOAL_TRANSLATION : _GOAL_TRANSLATION + 3] = task.translation
-    packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = np.array(task.translation) / task.target_distance
+def pack_task_parameters(task: Task) -> TaskParameters:
+    start = TASK_CLASSES.index(type(task)), task.t_start, task.timeout, task.translation
+    along: Any = np.array(task.translation) / task.target_distance
+    criteria: tuple[float, ...]
     if isinstance(task, Reach):
-        packed[[_TARGET_RADIUS, _DWELL_TIME]] = task.width / 2, task.dwell
-        return packed
-    packed[[_TARGET_RADIUS, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
-    packed[_DWELL_TIME] = task.hold if isinstance(task, Press) else task.dwell
-    if isinstance(task, Press):
-        packed[[_SET_FORCE, _FORCE_TOLERANCE]] = task.force, task.tolerance
-    if isinstance(task, Insert):
-        packed[_APPROACH_AXIS : _APPROACH_AXIS + 3] = 0.0, 0.0, -1.0
-        packed[[_SET_FORCE, _SLOT_DEPTH]] = task.push, task.depth
-    return packed
+        packed = TaskParameters(*start, along, task.width / 2, task.dwell)
+    else:
+        radius, standoff = max(0.25 * task.standoff, 1e-3), task.standoff
+        if isinstance(task, Press):
+            criteria = task.hold, standoff, task.force, task.tolerance
+        elif isinstance(task, Insert):
+            along, criteria = [0.0, 0.0, -1.0], (task.dwell, standoff, task.push, 0.0, task.depth)
+        else:
+            criteria = task.dwell, standoff
+        packed = TaskParameters(*start, along, radius, *criteria)
+    return as_compiled_arguments(packed)
 
 
 # Indices of `state` in `update_decision`.
 PHASE_INDEX, OUTCOME_INDEX, CONTACT_PERCEIVED_INDEX = range(3)
 FORCE_THRESHOLD_INDEX, CONTACT_TRUST_INDEX, STATE_SIZE = range(3, 6)
 """Indices of the signal task_state, and its size."""
-(
-    PHASE_WAITING,
-    PHASE_MOVING,
-    PHASE_APPROACHING,
-    PHASE_STOPPING,
-    PHASE_PRESSING,
-    PHASE_SEARCHING_SLOT,
-    PHASE_OVER,
-) = range(7)
+PHASE_WAITING, PHASE_MOVING, PHASE_APPROACHING, PHASE_STOPPING = range(4)
+PHASE_PRESSING, PHASE_SEARCHING_SLOT, PHASE_OVER = range(4, 7)
 """Phases: before the start; move by vision; careful approach until contact; stop; force control;
 search for the slot; finished or given up."""
 # Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
@@ -160,10 +146,8 @@ _FLOOR_DEPTH_SHARE = 0.8  # share of the depth beyond which contact counts as th
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_CRITERION_MET_SINCE], memory[_ASSUMED_CONTACT_STIFFNESS] = (
-        -1.0,
-        _INITIAL_ASSUMED_STIFFNESS,
-    )
+    memory[_CRITERION_MET_SINCE] = -1.0
+    memory[_ASSUMED_CONTACT_STIFFNESS] = _INITIAL_ASSUMED_STIFFNESS
     memory[PLAN_START_INDEX + 1] = 1.0
     return memory
 
@@ -173,12 +157,12 @@ def _convert_to_hand_motion(person, vector_W, out):
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
-            out[i] += person[_R_WB + 3 * k + i] * vector_W[k] / person[_TOOL_OVER_HAND_MOTION]
+            out[i] += person.R_WB[k, i] * vector_W[k] / person.translation_scale
 
 
 @njit(cache=True)
 def _draw_normal_number(person, step, draw):
-    return random_normal(np.uint64(person[_RANDOM_KEY]), 16 * step + draw)
+    return random_normal(np.uint64(person.random_key), 16 * step + draw)
 
 
 @njit(cache=True)
@@ -188,7 +172,7 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
-        noise = person[_VISION_NOISE] * _draw_normal_number(
+        noise = person.vision_noise * _draw_normal_number(
             person, step // _EYE_FIXATION_STEPS, 4 + i
         )
         seen_W[i] = displacement_W[i] + noise
@@ -200,10 +184,10 @@ def _plan_submovement(person, memory, step, time, error_W):
     _convert_to_hand_motion(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
-    duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_PEAK_ACCELERATION])
-    duration = max(duration, person[_MIN_MOVE_DURATION])
+    duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person.acceleration)
+    duration = max(duration, person.shortest)
     for i in range(3):
-        change[i] += person[_MOTOR_NOISE] * length * _draw_normal_number(person, step, i)
+        change[i] += person.noise * length * _draw_normal_number(person, step, i)
     plan_move(memory, time, duration, change, np.zeros(3))
     return duration
 
@@ -214,9 +198,9 @@ def _contact_force_against_axis(task, person, felt):
     for i in range(3):
         axis_B = 0.0
         for k in range(3):
-            axis_B += person[_R_WB + 3 * k + i] * task[_APPROACH_AXIS + k]
+            axis_B += person.R_WB[k, i] * task.approach_axis[k]
         along -= felt[i] * axis_B
-    return along / person[_FORCE_GAIN] if person[_FORCE_GAIN] > 0.0 else 0.0
+    return along / person.force_gain if person.force_gain > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -256,25 +240,25 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
     state[FORCE_THRESHOLD_INDEX] = felt[DETECTION_THRESHOLD_INDEX]
     # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
-    if person[_FORCE_GAIN] > 0.0:
-        unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
+    if person.force_gain > 0.0:
+        unnoticed = felt[DETECTION_THRESHOLD_INDEX] / (person.force_gain * person.gentle_force)
     state[CONTACT_TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_CONTACT_TRUST)
-    if state[PHASE_INDEX] == PHASE_WAITING and time >= task[_TASK_START_TIME]:
+    if state[PHASE_INDEX] == PHASE_WAITING and time >= task.start_time:
         _enter_phase(state, memory, PHASE_MOVING, time)
     if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
         return
-    if time - task[_TASK_START_TIME] > task[_TASK_TIMEOUT]:
+    if time - task.start_time > task.timeout:
         _finish_task(state, memory, time, -1.0)
     elif state[PHASE_INDEX] == PHASE_MOVING:
         _move_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE_INDEX] == PHASE_APPROACHING:
         _approach_contact(task, person, time, seen_W, felt, state, memory)
     elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_MOVE_TIME]:
-        if task[_TASK_KIND] == KIND_PRESS:
+        if task.kind == KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
             _update_criterion_met(memory, time, True, True)
-            and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]
+            and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
     elif state[PHASE_INDEX] == PHASE_PRESSING:
@@ -286,20 +270,20 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 @njit(cache=True)
 def _perceived_target_into(task, person, out):
     depth = 0.0
-    if task[_TASK_KIND] != KIND_REACH:
-        depth = person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
+    if task.kind != KIND_REACH:
+        depth = person.depth_error * _draw_normal_number(person, 0, 15)
     for i in range(3):
-        out[i] = task[_GOAL_TRANSLATION + i] + (depth - task[_STANDOFF]) * task[_APPROACH_AXIS + i]
-        if task[_TASK_KIND] == KIND_INSERT and i < 2:
-            out[i] += person[_AIM_ERROR] * _draw_normal_number(person, 0, 13 + i)
+        out[i] = task.goal[i] + (depth - task.standoff) * task.approach_axis[i]
+        if task.kind == KIND_INSERT and i < 2:
+            out[i] += person.aim_error * _draw_normal_number(person, 0, 13 + i)
 
 
 @njit(cache=True)
 def _perceived_penetration(task, person, seen_W):
-    target, beyond = np.empty(3), -task[_STANDOFF]
+    target, beyond = np.empty(3), -task.standoff
     _perceived_target_into(task, person, target)
     for i in range(3):
-        beyond += (seen_W[i] - target[i]) * task[_APPROACH_AXIS + i]
+        beyond += (seen_W[i] - target[i]) * task.approach_axis[i]
     return beyond
 
 
@@ -312,11 +296,9 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _update_criterion_met(
-        memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS]
-    )
-    if task[_TASK_KIND] == KIND_REACH:
-        if met and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]:
+    met = _update_criterion_met(memory, time, off <= 0.8 * task.radius, off <= task.radius)
+    if task.kind == KIND_REACH:
+        if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
             return
     elif met and time >= memory[_NEXT_MOVE_TIME]:
@@ -324,30 +306,29 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         return
     if not met and time >= memory[_NEXT_MOVE_TIME]:
         duration = _plan_submovement(person, memory, step, time, error)
-        memory[_NEXT_MOVE_TIME] = time + duration + person[_VISION_DELAY]
+        memory[_NEXT_MOVE_TIME] = time + duration + person.vision_delay
 
 
 @njit(cache=True)
 def _approach_contact(task, person, time, seen_W, felt, state, memory):
-    if task[_TASK_KIND] == KIND_INSERT:
+    if task.kind == KIND_INSERT:
         if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt):
             plan_stop(memory, time)
             _enter_phase(
-                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person[_FORCE_DELAY]
+                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person.force_delay
             )
             return
     elif state[CONTACT_PERCEIVED_INDEX] > 0.0:
         plan_stop(memory, time)
-        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_DELAY])
+        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_penetration(task, person, seen_W) > task[_SLOT_DEPTH] + _GIVE_UP_PENETRATION_M:
+    if _perceived_penetration(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
+        speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
         for i in range(3):
-            velocity_W[i] = (
-                state[CONTACT_TRUST_INDEX] * person[_APPROACH_SPEED] * task[_APPROACH_AXIS + i]
-            )
+            velocity_W[i] = speed_W * task.approach_axis[i]
         _convert_to_hand_motion(person, velocity_W, speed)
         plan = memory[PLAN_START_INDEX : PLAN_START_INDEX + PLAN_SIZE]
         for i in range(3):
@@ -358,7 +339,7 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_contact_force(task, person, felt, memory):
-    error = person[_WEBER_FRACTION] * _draw_normal_number(
+    error = person.weber_fraction * _draw_normal_number(
         person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3
     )
     return (1.0 + error) * _contact_force_against_axis(task, person, felt)
@@ -372,7 +353,7 @@ def _displacement_to_set_force(task, memory, force):
         memory[_ASSUMED_CONTACT_STIFFNESS] = min(
             max(stiffness, _MIN_ASSUMED_STIFFNESS), _MAX_ASSUMED_STIFFNESS
         )
-    move = (task[_SET_FORCE] - force) / memory[_ASSUMED_CONTACT_STIFFNESS]
+    move = (task.force - force) / memory[_ASSUMED_CONTACT_STIFFNESS]
     move = min(max(move, -_MAX_PRESS_CORRECTION_M), _MAX_PRESS_CORRECTION_M)
     memory[_LAST_PRESS_FORCE], memory[_LAST_PRESS_MOTION] = force, move
     return move
@@ -381,35 +362,33 @@ def _displacement_to_set_force(task, memory, force):
 @njit(cache=True)
 def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
-    error = abs(task[_SET_FORCE] - force)
+    error = abs(task.force - force)
     met = _update_criterion_met(
-        memory, time, error <= 0.5 * task[_FORCE_TOLERANCE], error <= task[_FORCE_TOLERANCE]
+        memory, time, error <= 0.5 * task.tolerance, error <= task.tolerance
     )
-    if met and time - memory[_CRITERION_MET_SINCE] >= task[_DWELL_TIME]:
+    if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
         move = _displacement_to_set_force(task, memory, force)
-        duration = _plan_submovement(
-            person, memory, step, time, move * task[_APPROACH_AXIS : _APPROACH_AXIS + 3]
-        )
-        memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]
+        duration = _plan_submovement(person, memory, step, time, move * task.approach_axis)
+        memory[_NEXT_MOVE_TIME] = time + duration + person.force_delay
 
 
 @njit(cache=True)
 def _lateral_force_into(task, person, felt, out):
     along, size = _contact_force_against_axis(task, person, felt), 0.0
     for i in range(3):
-        out[i] = along * task[_APPROACH_AXIS + i]
+        out[i] = along * task.approach_axis[i]
         for k in range(3):
-            if person[_FORCE_GAIN] > 0.0:
-                out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_FORCE_GAIN]
+            if person.force_gain > 0.0:
+                out[i] += person.R_WB[i, k] * felt[k] / person.force_gain
         size += out[i] * out[i]
     return math.sqrt(size)
 
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, felt):
-    limit = _STUCK_SHARE_OF_PUSH_FORCE * task[_SET_FORCE]
+    limit = _STUCK_SHARE_OF_PUSH_FORCE * task.force
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
     return _contact_force_against_axis(task, person, felt) >= limit or sideways >= limit
 
@@ -426,13 +405,13 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_penetration(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task[_SLOT_DEPTH]
-    if deep and abs(force - task[_SET_FORCE]) <= _STUCK_SHARE_OF_PUSH_FORCE * task[_SET_FORCE]:
+    deep = _perceived_penetration(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
+    if deep and abs(force - task.force) <= _STUCK_SHARE_OF_PUSH_FORCE * task.force:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     move, push = np.empty(3), _displacement_to_set_force(task, memory, force)
     sideways = _lateral_force_into(task, person, felt, move)
-    if sideways >= state[FORCE_THRESHOLD_INDEX] / person[_FORCE_GAIN]:
+    if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
         share = min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
         for i in range(3):
             move[i] *= share
@@ -443,6 +422,6 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
             move[k] = _spiral_coordinate(n + 1, k) - _spiral_coordinate(n, k)
         move[2] = 0.0
     for i in range(3):
-        move[i] += push * task[_APPROACH_AXIS + i]
+        move[i] += push * task.approach_axis[i]
     duration = _plan_submovement(person, memory, step, time, move)
-    memory[_NEXT_MOVE_TIME] = time + duration + person[_FORCE_DELAY]
+    memory[_NEXT_MOVE_TIME] = time + duration + person.force_delay

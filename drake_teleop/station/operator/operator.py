@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -18,6 +17,7 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     conjugate_quaternion,
     copy_into,
@@ -110,7 +110,7 @@ class OperatorConfig:
         return GRIP_IMPEDANCES[self.grip]
 
 
-def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
+def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> Array:
     """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
     Columns: start and length of the ramp in and of the ramp out, 2 pi frequency, phase,
@@ -251,7 +251,7 @@ def _perceive_and_decide(
     decision.update_decision(task, person, time, seen, felt, task_state, memory)
 
 
-def _make_ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+def _make_ring_buffer(delay: float, start: Array) -> Array:
     return np.tile(start, (round(delay / decision.DECISION_PERIOD_S) + 1, 1))
 
 
@@ -282,10 +282,10 @@ class Operator(LeafSystem):
     def __init__(
         self,
         config: OperatorConfig,
-        start: NDArray[np.float64],
+        start: Array,
         training: OperatorTraining | None = None,
         arm: ArmModel | None = None,
-        tip: NDArray[np.float64] | None = None,
+        tip: Array | None = None,
     ) -> None:
         super().__init__()
         hand = config.hand
@@ -320,7 +320,7 @@ class Operator(LeafSystem):
         task: Task,
         training: OperatorTraining,
         arm: ArmModel,
-        tip: NDArray[np.float64],
+        tip: Array,
     ) -> DependencyTicket:
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
@@ -358,46 +358,33 @@ class Operator(LeafSystem):
         state = [discrete_state.get_mutable_value(group) for group in self._groups]
         state[3] = state[3].reshape(self._seen_displacements.shape)
         state[4] = state[4].reshape(self._perceived_forces.shape)
-        _perceive_and_decide(
-            *self._task_parameters,
-            context.get_time(),
-            self._wrench.Eval(context),
-            self._twist.Eval(context),
-            self._slave.Eval(context)[: self._joints],
-            *state,
-        )
+        stylus = self._wrench.Eval(context), self._twist.Eval(context)
+        slave_q = self._slave.Eval(context)[: self._joints]
+        _perceive_and_decide(*self._task_parameters, context.get_time(), *stylus, slave_q, *state)
 
-    def _decision_memory(self, context: Context) -> NDArray[np.float64]:
+    def _decision_memory(self, context: Context) -> Array:
         if not self._has_task:
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
 
-    def _evaluate_intended_motion(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+    def _evaluate_intended_motion(self, context: Context) -> tuple[Array, ...]:
         if not self._intended_pose.HasValue(context):
             return self._intent
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
         if not normalize_pose_into(pose, twist, self._commanded_pose):
-            raise DrakeTeleopError(
-                f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
-                where="intended_pose",
-                remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
-            )
+            what = f"the intended motion at {context.get_time():g} s is not a finite pose and twist"
+            remedy = "give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s"
+            raise DrakeTeleopError(what, where="intended_pose", remedy=remedy)
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _hand_wrench_at_time(
-            *self._evaluate_intended_motion(context),
-            self._decision_memory(context),
-            context.get_time(),
-            self._impedance,
-            self._intent_pose,
-            self._intent_twist,
-            self._pose.Eval(context),
-            self._twist.Eval(context),
-            output.get_mutable_value(),
-        )
+        intent = *self._evaluate_intended_motion(context), self._decision_memory(context)
+        own = self._impedance, self._intent_pose, self._intent_twist
+        stylus = self._pose.Eval(context), self._twist.Eval(context)
+        wrench = output.get_mutable_value()
+        _hand_wrench_at_time(*intent, context.get_time(), *own, *stylus, wrench)
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
         time = context.get_time()

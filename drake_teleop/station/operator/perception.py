@@ -9,14 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import broadcast_to_rows, finite_array
-
-Array = NDArray[np.float64]
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _FORCE_MODEL_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
@@ -50,12 +48,8 @@ class Perception:
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
-    depth_error: float = quantity(
-        2e-3, "m", 0.0, 0.1, "standard deviation of the perceived distance of a surface"
-    )
-    aim_error: float = quantity(
-        1e-3, "m", 0.0, 0.1, "standard deviation of the perceived lateral position of a slot"
-    )
+    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a surface's distance")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's lateral place")
 
     def compiled_parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per `dt` [s]."""
@@ -175,9 +169,8 @@ def perceive_contact(
     times = finite_array("t", t, len(force))
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
-        raise DrakeTeleopError(
-            "times do not increase", where="t", remedy="give at least two samples in order of time"
-        )
+        what = "times do not increase"
+        raise DrakeTeleopError(what, where="t", remedy="give at least two samples in order of time")
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.compiled_parameters(dt)
     _perceive_recorded_motion(

@@ -33,9 +33,7 @@ class Reach(_Task):
 
 @dataclass
 class _ContactTask(_Task):
-    standoff: float = quantity(
-        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
-    )
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance where the careful approach starts")
 
 
 @settings
@@ -73,14 +71,8 @@ TASK_CLASSES = (Reach, Touch, Press, Insert)
 
 #: Names of the measures that `station.task_measures` defines.
 TASK_MEASURE_NAMES = (
-    "success",
-    "task_time_s",
-    "contact_force_overshoot_N",
-    "effort_Ns",
-    "task_work_J",
-    "detection_time_s",
-    "false_notices",
-    "press_error_N",
+    *("success", "task_time_s", "contact_force_overshoot_N", "effort_Ns", "task_work_J"),
+    *("detection_time_s", "false_notices", "press_error_N"),
 )
 
 
@@ -89,13 +81,9 @@ TASK_MEASURE_NAMES = (
 class Movement:
     """Parameters of the operator's movements; see docs/operator.md."""
 
-    acceleration: float = quantity(
-        1.5, "m/s^2", 0.01, 50.0, "peak acceleration of the hand in a submovement"
-    )
+    acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak acceleration in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
-    noise: float = quantity(
-        0.05, "1", 0.0, 0.5, "standard deviation of the end point over the length"
-    )
+    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point over length")
     approach_speed: float = quantity(
         0.03, "m/s", 1e-3, 1.0, "speed of the tool in a careful approach, at full trust"
     )

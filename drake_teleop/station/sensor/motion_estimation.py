@@ -7,20 +7,21 @@ Sources of specific force s of So, angular velocity omega and acceleration alpha
 - `fused`: a steady-state Kalman filter per axis integrates s and alpha, corrected by the encoders.
 """
 
+from collections import namedtuple
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
     copy_into,
     cross,
-    matrix_at,
+    matrix_as_tuple,
     minus,
     plus,
     transposed,
@@ -57,15 +58,14 @@ _SENSOR_RMS_LEVER_M_PER_RAD = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
 _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
-# Constants: period, whether the encoders are the only source, whether they correct the
-# accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAIT_SAMPLES = 0, 1, 2, 3
-_ACCELEROMETER_POSITION = 6  # (3,)
-_ACCELEROMETER_AXES = _ACCELEROMETER_POSITION + 3  # (3, 3)
-_ANGLE_LOW_PASSES = _ACCELEROMETER_AXES + 9  # (4, 5) the sensor's and those of `encoders`
+#: Constants: whether the encoders are the only source, and whether they correct the accelerometer;
+#: waits of wrench, acceleration, angles (fractional); low-passes of the sensor and of `encoders`.
+_EstimatorConstants = namedtuple(
+    "_EstimatorConstants",
+    "period encoders_only fused wait_samples accelerometer_position R_SA angle_low_passes"
+    " angle_gains linear_gains",
+)
 _NUM_ANGLE_SECTIONS = 4
-_ANGLE_FUSION_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_ANGLE_SECTIONS
-_LINEAR_FUSION_GAINS = _ANGLE_FUSION_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
@@ -83,9 +83,7 @@ _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_SECTIONS
 class MotionEstimationConfig:
     """Settings of the motion estimation of the sensor frame S."""
 
-    source: str = choice(
-        "accelerometer", _MOTION_SOURCES, "source of angular velocity and accelerations"
-    )
+    source: str = choice("accelerometer", _MOTION_SOURCES, "of angular velocity and accelerations")
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
@@ -112,7 +110,7 @@ class PathDelays:
 
 def steady_state_kalman_gains(
     position_std: float, acceleration_std: float, drift: float, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     """Return gains (3,) of the innovation for position [1], rate [1/s], acceleration [1/s^2].
 
     The Kalman filter has a measured position x, and an acceleration a with a drifting error.
@@ -153,7 +151,7 @@ def path_delays(
 
 def fusion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
@@ -167,7 +165,7 @@ def fusion_gains(
 
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
@@ -191,9 +189,7 @@ def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
     return float(rounding * np.sqrt(num_joints / 3.0))
 
 
-def _accelerometer_std(
-    sensor: WristSensorConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _accelerometer_std(sensor: WristSensorConfig) -> tuple[Array, Array]:
     """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer_pose()
@@ -205,7 +201,7 @@ def _accelerometer_std(
 
 def initialize_motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[_EstimatorConstants, Array]:
     """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench_s, delays.acceleration_s, delays.encoders_s])
@@ -213,29 +209,23 @@ def initialize_motion_estimator(
     waits = np.where(used, delays.sample_s - paths, 0.0) / period
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
-    p_SoAo_S, R_SA = sensor.accelerometer_pose()
-    angular, linear = fusion_gains(config, sensor, num_joints, period)
-    constants = np.concatenate(
-        [
-            # An ideal accelerometer needs no correction.
-            [period, config.source == "encoders", config.source == "fused" and not sensor.ideal],
-            waits,
-            p_SoAo_S,
-            R_SA.ravel(),
-            _angle_low_pass_sections(config, sensor, period).ravel(),
-            angular,
-            linear,
-        ]
+    constants = _EstimatorConstants(
+        period,
+        config.source == "encoders",
+        config.source == "fused" and not sensor.ideal,  # an ideal one needs no correction
+        waits,
+        *sensor.accelerometer_pose(),
+        _angle_low_pass_sections(config, sensor, period),
+        *fusion_gains(config, sensor, num_joints, period),
     )
     rows = int(np.ceil(waits.max())) + 1
-    return constants, np.zeros(
-        _JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * num_joints + rows * (12 + num_joints)
-    )
+    size = _MEMORY_SIZE_PER_JOINT * num_joints + rows * (12 + num_joints)
+    return as_compiled_arguments(constants), np.zeros(_JOINT_MEMORY_START + size)
 
 
 def _angle_low_pass_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
-) -> NDArray[np.float64]:
+) -> Array:
     filters = np.zeros((_NUM_ANGLE_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
@@ -252,7 +242,7 @@ def _angle_low_pass_sections(
     return filters
 
 
-def _group_delay_samples(sections: NDArray[np.float64]) -> float:
+def _group_delay_samples(sections: Array) -> float:
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 
@@ -276,7 +266,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
             joints[2 * n + i] = angles[i % n]
     _differentiate_joint_angles(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
-    if constants[_USE_ENCODERS_INDEX] != 0.0:
+    if constants.encoders_only != 0.0:
         copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
         _convert_accelerometer(constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample)
@@ -299,10 +289,7 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
 
 @njit(cache=True)
 def _align_signal_paths(constants, memory, n, reading, sample):
-    sections, angles = (
-        constants[_ANGLE_LOW_PASSES:_ANGLE_FUSION_GAINS],
-        sample[SAMPLE_JOINT_POSITION],
-    )
+    sections, angles = constants.angle_low_passes, sample[SAMPLE_JOINT_POSITION]
     filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
@@ -319,14 +306,14 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
-    wrench = int(constants[_PATH_WAIT_SAMPLES]) * width
-    acceleration = int(constants[_PATH_WAIT_SAMPLES + 1]) * width
+    wrench = int(constants.wait_samples[0]) * width
+    acceleration = int(constants.wait_samples[1]) * width
     waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_PATH_WAIT_SAMPLES + 2])
-    older = constants[_PATH_WAIT_SAMPLES + 2] - wait
+    wait = int(constants.wait_samples[2])
+    older = constants.wait_samples[2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
@@ -338,23 +325,21 @@ def _align_signal_paths(constants, memory, n, reading, sample):
 
 @njit(cache=True)
 def _differentiate_joint_angles(constants, joints, angles):
-    n, period = angles.shape[0], constants[_PERIOD_INDEX]
+    n, period = angles.shape[0], constants.period
     for i in range(n):
         q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
         joints[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
-        if constants[_USE_ENCODERS_INDEX] != 0.0:
+        if constants.encoders_only != 0.0:
             joints[n + i] = (2.0 * q0 - 5.0 * q1 + 4.0 * q2 - q3) / (period * period)
         joints[2 * n + i], joints[3 * n + i], joints[4 * n + i] = q0, q1, q2
 
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    period = constants[_PERIOD_INDEX]
-    fused = constants[_USE_FUSION_INDEX] != 0.0
-    starts = memory[0] == 0.0
+    period, fused, starts = constants.period, constants.fused != 0.0, memory[0] == 0.0
     s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
     alpha = sample[SAMPLE_ANGULAR_ACCELERATION]
-    R_SA, R = matrix_at(constants, _ACCELEROMETER_AXES), motion[12:21]
+    R_SA, R = matrix_as_tuple(constants.R_SA), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     for i in range(3):
@@ -370,7 +355,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
-        _update_fusion_filters(constants[_ANGLE_FUSION_GAINS:], period, motion, alpha, angular)
+        _update_fusion_filters(constants.angle_gains, period, motion, alpha, angular)
         for i in range(3):
             angular[12 + i] -= motion[i]
             alpha[i] += motion[i]
@@ -378,7 +363,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
     # From Ao to So, with r = p_SoAo_S.
-    r, w = vector_at(constants, _ACCELEROMETER_POSITION), vector_at(omega, 0)
+    r, w = vector_at(constants.accelerometer_position, 0), vector_at(omega, 0)
     s[0], s[1], s[2] = minus(s, add_cross_product(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
@@ -389,7 +374,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # reuses the encoders' omega
         a_W[0], a_W[1], a_W[2] = plus(apply_matrix(R, s), gravity)
-        _update_fusion_filters(constants[_LINEAR_FUSION_GAINS:], period, motion, a_W, linear)
+        _update_fusion_filters(constants.linear_gains, period, motion, a_W, linear)
         correction = apply_matrix(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]

@@ -6,10 +6,7 @@ step; the block holds pose and velocity of this state to pair them.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
@@ -29,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -69,8 +67,6 @@ from drake_teleop.station.sensor.sensor_chain import (
     read_sensor_into,
 )
 
-Array = NDArray[np.float64]
-
 _NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
 _DEFAULT_SAMPLING_PERIOD_S = 1e-3
@@ -79,20 +75,10 @@ _STEP_RATIO_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
 _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
-_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR, _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = (
-    12,
-    21,
-    24,
-    27,
-)
+_WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
+_GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _BODY_MOTION_SIZE = 12
-
-
-class _SensorWeld(NamedTuple):
-    reaction_index: int
-    body_index: int
-    geometry: Array
 
 
 def AddWristSensor(
@@ -319,35 +305,26 @@ def _measure_sample_into(sensor, truth, noise, memory, sample):
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
     expect_type(MultibodyPlant, plant, f"{_NAME_IN_ERRORS}: plant")
     if not plant.is_finalized():
-        raise DrakeTeleopError(
-            f"plant '{plant.get_name()}' is not finalized",
-            where=_NAME_IN_ERRORS,
-            remedy="call plant.Finalize() first",
-        )
+        what = f"plant '{plant.get_name()}' is not finalized"
+        raise DrakeTeleopError(what, where=_NAME_IN_ERRORS, remedy="call plant.Finalize() first")
     if plant not in builder.GetSystems():
-        raise DrakeTeleopError(
-            f"plant '{plant.get_name()}' is not in this builder",
-            where=_NAME_IN_ERRORS,
-            remedy="add it by builder.AddSystem(plant) first",
-        )
+        what = f"plant '{plant.get_name()}' is not in this builder"
+        remedy = "add it by builder.AddSystem(plant) first"
+        raise DrakeTeleopError(what, where=_NAME_IN_ERRORS, remedy=remedy)
 
 
 def _event_period_and_ratio(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
-        raise DrakeTeleopError(
-            f"a sampling period of {period} s is not positive and finite",
-            where=f"{_NAME_IN_ERRORS}: period",
-            remedy="give the time between samples [s]",
-        )
+        what = f"a sampling period of {period} s is not positive and finite"
+        remedy = "give the time between samples [s]"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: period", remedy=remedy)
     if step is None:
         return period or _DEFAULT_SAMPLING_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
-        raise DrakeTeleopError(
-            f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s",
-            where=f"{_NAME_IN_ERRORS}: period",
-            remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
-        )
+        what = f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s"
+        remedy = f"choose a multiple, such as {max(1, round(count)) * step:g} s"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: period", remedy=remedy)
     return step, round(count)
 
 
@@ -356,11 +333,9 @@ def _sensor_frame_and_weld(
 ) -> tuple[Frame, WeldJoint]:
     expect_type((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
-        raise DrakeTeleopError(
-            f"joint or frame '{joint_or_frame.name()}' belongs to another plant",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="pass a joint or frame of this plant",
-        )
+        what = f"joint or frame '{joint_or_frame.name()}' belongs to another plant"
+        remedy = "pass a joint or frame of this plant"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     welds = [joint for joint in _joints_of_plant(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
@@ -369,18 +344,14 @@ def _sensor_frame_and_weld(
         if len(beyond) != 1:
             names = ", ".join(f"'{joint.name()}'" for joint in beyond)
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
-            raise DrakeTeleopError(
-                f"the body '{S.body().name()}' of frame '{S.name()}' has {found}",
-                where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-                remedy="pass the WeldJoint between arm and tool",
-            )
+            what = f"the body '{S.body().name()}' of frame '{S.name()}' has {found}"
+            remedy = "pass the WeldJoint between arm and tool"
+            raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
         return S, beyond[0]
     if not isinstance(joint_or_frame, WeldJoint):
-        raise DrakeTeleopError(
-            f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="weld the tool to the arm and pass this WeldJoint",
-        )
+        what = f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld"
+        remedy = "weld the tool to the arm and pass this WeldJoint"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     parent = joint_or_frame.frame_on_parent()
     arm, _ = _arm_body_and_load(plant, joint_or_frame)
     on_parent = parent.body().index() == arm
@@ -406,14 +377,13 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
     return arm, [BodyIndex(int(k)) for k in np.flatnonzero(group == group[int(load)])]
 
 
-def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
+def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> tuple[int, int, Array]:
+    """Return the indices of reaction and body of S in the plant's ports, and the geometry."""
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
-        raise DrakeTeleopError(
-            f"the tool beyond joint '{joint.name()}' has no mass",
-            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
-            remedy="give a body of the tool a SpatialInertia",
-        )
+        what = f"the tool beyond joint '{joint.name()}' has no mass"
+        remedy = "give a body of the tool a SpatialInertia"
+        raise DrakeTeleopError(what, where=f"{_NAME_IN_ERRORS}: joint_or_frame", remedy=remedy)
     on_parent = joint.parent_body().index() == arm
     X_BS, X_BJc = S.GetFixedPoseInBodyFrame(), joint.frame_on_child().GetFixedPoseInBodyFrame()
     if on_parent:
@@ -421,15 +391,8 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Sens
     X_SJc = X_BS.InvertAndCompose(X_BJc)
     instance = (joint.child_body() if on_parent else joint.parent_body()).model_instance()
     gravity = plant.gravity_field().gravity_vector() * plant.is_gravity_enabled(instance)
-    geometry = np.concatenate(
-        [
-            X_BS.translation(),
-            X_BS.rotation().matrix().ravel(),
-            X_SJc.rotation().matrix().ravel(),
-            X_SJc.translation(),
-            gravity,
-            [1.0 if on_parent else -1.0],
-        ]
-    )
+    rotations = [X.rotation().matrix().ravel() for X in (X_BS, X_SJc)]
+    places = [X_BS.translation(), *rotations, X_SJc.translation()]
+    geometry = np.concatenate([*places, gravity, [1.0 if on_parent else -1.0]])
     reaction = list(plant.GetJointIndices()).index(joint.index())
-    return _SensorWeld(reaction, int(S.body().index()), geometry)
+    return reaction, int(S.body().index()), geometry

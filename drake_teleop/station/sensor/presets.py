@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from typing import Any
 
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
@@ -100,9 +99,3 @@ accuracy 0.8 N, modelled by gain errors, cross-talk and a walk. Set `rates.senso
 rate: 7000 (ATI), 800 (Bota), 100 (Robotiq), 500 (OnRobot, UR), 1000 (Franka); reduce `bandwidth_hz`
 accordingly.
 """
-
-
-def preset_of_block(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """Return the default settings for a scenario's block `wrist_sensor`, from its `preset`."""
-    name = (block or {}).get("preset")
-    return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))

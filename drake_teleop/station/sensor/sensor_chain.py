@@ -12,6 +12,7 @@ low-pass is analog or mechanical (`before_noise`), or digital as in the JR3 (`af
 
 import copy
 import dataclasses
+from collections import namedtuple
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,13 +23,14 @@ from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
     copy_into,
     cross,
     cross_matrix,
-    matrix_at,
+    matrix_as_tuple,
     vector_at,
 )
 from drake_teleop.load.regressor import (
@@ -79,34 +81,18 @@ class WristSensorConfig:
     ideal: bool = plain(False, "true values at the sampling instant, at So in S, without all parts")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(
-        0.0, "1", 0.0, 0.1, "largest cross-talk, share of range per full range"
-    )
-    misalignment: float = quantity(
-        0.0, "rad", 0.0, 0.2, "angle from S to the real axes of the wrench"
-    )
-    acceleration_gain_error: float = quantity(
-        0.0, "1", 0.0, 0.1, "largest gain error of the accelerations"
-    )
-    acceleration_misalignment: float = quantity(
-        0.0, "rad", 0.0, 0.2, "angle from A to the real axes"
-    )
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest cross-talk in ranges per full range")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
+    acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
+    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
     unit: int = plain(0, "seed of the calibration errors within their bounds")
 
-    p_SoAo_S: list[float] = quantity(
-        [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "position of the accelerometer"
-    )
+    p_SoAo_S: list[float] = quantity([0.0, 0.0, 0.0175], "m", -1.0, 1.0, "accelerometer position")
     R_SA: list[float] = quantity(
-        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        "1",
-        -1.0,
-        1.0,
-        "axes of the accelerometer, row by row",
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "accelerometer axes by rows"
     )
 
-    low_pass: str = choice(
-        "after_converter", _LOW_PASS_CHOICES, "position of the low-pass in the chain"
-    )
+    low_pass: str = choice("after_converter", _LOW_PASS_CHOICES, "low-pass position in the chain")
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
@@ -122,11 +108,7 @@ class WristSensorConfig:
         [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
     )
     drift: list[float] = quantity(
-        [4e-4, -3e-4, 8.3e-4, 2e-5, -2e-5, 1e-5],
-        "N/s, N m/s",
-        -10.0,
-        10.0,
-        "thermal drift of the offset",
+        [4e-4, -3e-4, 8.3e-4, 2e-5, -2e-5, 1e-5], "N/s, N m/s", -10.0, 10.0, "thermal offset drift"
     )
     acceleration_offset: list[float] = quantity(
         [0.0] * 6, "m/s^2, rad/s^2", -100.0, 100.0, "offset of specific force, angular acceleration"
@@ -143,50 +125,41 @@ class WristSensorConfig:
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
-    force_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of force and torque, rounded to whole samples"
-    )
-    acceleration_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of accelerations, rounded to whole samples"
-    )
-    encoder_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "latency of joint angles, rounded to whole samples"
-    )
+    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "of force and torque, whole samples")
+    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "of accelerations, whole samples")
+    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of joint angles, whole samples")
 
-    def noise_std(self) -> NDArray[np.float64]:
+    def noise_std(self) -> Array:
         """Return the standard deviations (12,) of white noise in raw samples, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
-    def random_walk(self) -> NDArray[np.float64]:
+    def random_walk(self) -> Array:
         """Return the standard deviations (12,) of the random walks after 1 s, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
-    def ranges(self) -> NDArray[np.float64]:
+    def ranges(self) -> Array:
         """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
         motion = [self.acceleration_range] * 3 + [self.angular_acceleration_range] * 3
         return np.array([*self.force_range, *self.torque_range, *motion], np.float64)
 
-    def largest_plausible_wrench(self) -> NDArray[np.float64]:
+    def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible readings (6,) of force and torque [N, N m]."""
-        share = (
-            _PLAUSIBLE_RANGES_SATURATED
-            if self.saturates and not self.ideal
-            else _PLAUSIBLE_RANGES_UNSATURATED
-        )
-        return share * self.ranges()[:6]
+        if self.saturates and not self.ideal:
+            return _PLAUSIBLE_RANGES_SATURATED * self.ranges()[:6]
+        return _PLAUSIBLE_RANGES_UNSATURATED * self.ranges()[:6]
 
-    def wrench_std(self) -> NDArray[np.float64]:
+    def wrench_std(self) -> Array:
         """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
-    def motion_std(self) -> NDArray[np.float64]:
+    def motion_std(self) -> Array:
         """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
-    def accelerometer_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def accelerometer_pose(self) -> tuple[Array, Array]:
         """Return position p_SoAo_S (3,) [m] and axes R_SA (3, 3) of the accelerometer."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
@@ -197,7 +170,7 @@ class WristSensorConfig:
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
-    def reading_delays(self, period: float) -> NDArray[np.float64]:
+    def reading_delays(self, period: float) -> Array:
         """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
         delays = self.latency_samples(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
@@ -210,11 +183,9 @@ class WristSensorConfig:
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
-            raise DrakeTeleopError(
-                "is not a rotation: its rows must be orthogonal unit vectors with determinant +1",
-                where=f"{where}.R_SA",
-                remedy="give nine numbers row by row; its columns are the axes of A in S",
-            )
+            what = "is not a rotation: its rows must be orthogonal unit vectors with determinant +1"
+            remedy = "give nine numbers row by row; its columns are the axes of A in S"
+            raise DrakeTeleopError(what, where=f"{where}.R_SA", remedy=remedy)
         filtered = not self.ideal and self.low_pass != "none"
         if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
             raise DrakeTeleopError(
@@ -233,10 +204,7 @@ _NOISY_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
-    "place": {
-        "p_SoAo_S": [0.0] * 3,
-        "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-    },
+    "place": {"p_SoAo_S": [0.0] * 3, "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
     "low_pass": {"low_pass": "none"},
     "noise": {f"{name}_noise": 0.0 for name in _NOISY_QUANTITIES},
     "random_walk": {f"{name}_walk": 0.0 for name in _NOISY_QUANTITIES},
@@ -258,7 +226,7 @@ def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
-def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
+def butterworth_sections(cutoff_hz: float, rate_hz: float) -> Array:
     """Return two second-order sections [b0, b1, b2, a1, a2] of a 4th-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_NUM_LOW_PASS_SECTIONS, 5))
@@ -270,9 +238,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
     return sections
 
 
-def calibration_matrices(
-    config: WristSensorConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array]:
     """Return matrices from true values to values with calibration errors; seed: `config.unit`.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
@@ -291,31 +257,24 @@ def calibration_matrices(
     return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
 
 
-def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _rotation_about_axis(axis: Array, angle: float) -> Array:
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-#: Constants: offset of force and torque, which may change during a run.
-OFFSET_CONSTANTS = slice(0, 6)
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
 TRUE_JOINT_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
-# Constants: 12 offsets, 12 drifts per sample, then these.
-_DRIFT_PER_SAMPLE_START, _NOISE_STD_START, _WALK_STEP_STD_START, _RESOLUTION_START, _RANGE_START = (
-    range(12, 72, 12)
+#: Constants of the chain: those up to `range` are of 12 channels, and `offset` may change in a run.
+#: Calibrations: (6, 6) of the wrench, (2, 3, 3) of s and alpha from S into A; low-pass: (2, 5).
+_ChainConstants = namedtuple(
+    "_ChainConstants",
+    "offset drift_per_sample noise_std walk_step_std quantum range wrench_calibration"
+    " motion_calibration accelerometer_position low_pass low_pass_stage latency_samples"
+    " encoder_quantum is_ideal overload_limits",
 )
-_WRENCH_CALIBRATION = 72  # (6, 6)
-_MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s and alpha
-_ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
-_LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
-_LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
-_PATH_LATENCY_SAMPLES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER_QUANTUM = _PATH_LATENCY_SAMPLES + 3
-_IS_IDEAL = _ENCODER_QUANTUM + 1
-_OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
 _LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -327,10 +286,10 @@ _DELAY_LINE_ROW_SIZE = _NUM_CHANNELS + 2
 
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[_ChainConstants, Array]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants.offset[:6]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer_pose()
@@ -339,32 +298,26 @@ def initialize_sensor_chain(
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
     latencies = config.latency_samples(period)
-    constants = np.concatenate(
-        [
-            config.offset,
-            config.acceleration_offset,
-            np.array(config.drift) * period,
-            np.zeros(6),
-            config.noise_std(),
-            config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
-            config.resolution * config.ranges(),
-            limits,
-            wrench.ravel(),
-            (force @ R_SA.T).ravel(),
-            (angular @ R_SA.T).ravel(),
-            p_SoAo_S,
-            sections.ravel(),
-            [
-                _LOW_PASS_CHOICES.index(config.low_pass),
-                *latencies,
-                config.encoder_resolution,
-                config.ideal,
-            ],
-            _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
-        ]
+    constants = _ChainConstants(
+        [*config.offset, *config.acceleration_offset],
+        np.append(np.array(config.drift) * period, np.zeros(6)),
+        config.noise_std(),
+        config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
+        config.resolution * config.ranges(),
+        limits,
+        wrench,
+        [force @ R_SA.T, angular @ R_SA.T],
+        p_SoAo_S,
+        sections,
+        _LOW_PASS_CHOICES.index(config.low_pass),
+        latencies,
+        config.encoder_resolution,
+        config.ideal,
+        _PLAUSIBLE_RANGES_UNSATURATED * config.ranges()[:6],
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    memory = np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW_SIZE + num_joints))
+    return as_compiled_arguments(constants), memory
 
 
 @njit(cache=True)
@@ -372,7 +325,7 @@ def are_values_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
-        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOAD_LIMITS + i]
+        good = good and abs(truth[i] + constants.offset[i]) <= constants.overload_limits[i]
     for i in range(6, truth.shape[0]):
         good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
@@ -391,7 +344,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
     angles = truth[TRUE_JOINT_ANGLES]
-    if constants[_IS_IDEAL] != 0.0:
+    if constants.is_ideal != 0.0:
         copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
         copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
         copy_into(reading, READ_ACCELERATION.start + 3, truth, SAMPLE_ANGULAR_ACCELERATION.start, 3)
@@ -406,13 +359,11 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     channels = row[:_NUM_CHANNELS]
     walks = memory[_RANDOM_WALK_START:FILTER_MEMORY_START]
     filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_START]
-    sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
+    sections, place = constants.low_pass, constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
+        step = noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
         for i in range(_NUM_CHANNELS):
-            walks[i] += (
-                constants[_WALK_STEP_STD_START + i]
-                * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
-            )
+            walks[i] += constants.walk_step_std[i] * step[i]
 
     _apply_calibration_errors(constants, truth, channels)
     if place == _LOW_PASS_BEFORE_NOISE:
@@ -420,17 +371,17 @@ def read_sensor_into(constants, memory, noise, truth, reading):
             settle_low_pass(sections, filtered, channels)
         low_pass_in_place(sections, filtered, channels)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[i] + count * constants[_DRIFT_PER_SAMPLE_START + i]
+        channels[i] += constants.offset[i] + count * constants.drift_per_sample[i]
     if place == _LOW_PASS_AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
     first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
     for i in range(_NUM_CHANNELS):
-        channels[i] += constants[_NOISE_STD_START + i] * noise[first + i] + walks[i]
+        channels[i] += constants.noise_std[i] * noise[first + i] + walks[i]
     row[_NUM_CHANNELS] = _quantize_and_saturate(constants, 0, 6, channels)
     row[_NUM_CHANNELS + 1] = _quantize_and_saturate(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER_QUANTUM]
+    quantum = constants.encoder_quantum
     for i in range(_DELAY_LINE_ROW_SIZE, width):
         angle = angles[i - _DELAY_LINE_ROW_SIZE]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
@@ -439,7 +390,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_PATH_LATENCY_SAMPLES:_ENCODER_QUANTUM]
+    late = constants.latency_samples
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -468,21 +419,20 @@ def _apply_calibration_errors(constants, truth, out):
     for i in range(6):
         value = 0.0
         for j in range(6):
-            value += constants[_WRENCH_CALIBRATION + 6 * i + j] * wrench[j]
+            value += constants.wrench_calibration[i, j] * wrench[j]
         out[i] = value
-    r = vector_at(constants, _ACCELEROMETER_POSITION)
+    r = vector_at(constants.accelerometer_position, 0)
     at_Ao = add_cross_product(add_cross_product(s, alpha, r), omega, cross(omega, r))
-    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION), at_Ao)
-    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION + 9), alpha)
+    force, angular = constants.motion_calibration[0], constants.motion_calibration[1]
+    out[6], out[7], out[8] = apply_matrix(matrix_as_tuple(force), at_Ao)
+    out[9], out[10], out[11] = apply_matrix(matrix_as_tuple(angular), alpha)
 
 
 @njit(cache=True)
 def _quantize_and_saturate(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum = constants[_RESOLUTION_START + i]
-        limit = constants[_RANGE_START + i]
-        value = channels[i]
+        quantum, limit, value = constants.quantum[i], constants.range[i], channels[i]
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)
         if abs(value) >= limit:
@@ -494,11 +444,10 @@ def _quantize_and_saturate(constants, first, end, channels):
 
 @njit(cache=True)
 def low_pass_in_place(sections, memory, values):
-    """Apply the second-order `sections` (5 k,) in series to `values` (n,) in place."""
+    """Apply the second-order `sections` (k, 5) in series to `values` (n,) in place."""
     n = values.shape[0]
-    for k in range(sections.shape[0] // 5):
-        b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]
-        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+    for k in range(sections.shape[0]):
+        b0, b1, b2, a1, a2 = sections[k]
         if b0 == 1.0:
             continue
         first, second = 2 * k * n, (2 * k + 1) * n
@@ -514,9 +463,8 @@ def low_pass_in_place(sections, memory, values):
 def settle_low_pass(sections, memory, values):
     """Set the memory of `low_pass_in_place` to its steady state at `values` (n,)."""
     n = values.shape[0]
-    for k in range(sections.shape[0] // 5):
-        b1, b2 = sections[5 * k + 1], sections[5 * k + 2]
-        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+    for k in range(sections.shape[0]):
+        _, b1, b2, a1, a2 = sections[k]
         for i in range(n):
             second = (b2 - a2) * values[i]
             memory[(2 * k + 1) * n + i] = second

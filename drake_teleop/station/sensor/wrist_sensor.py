@@ -8,6 +8,9 @@ the compiled contact law (`ToolContactModel.beyond`) each sample is an event at 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache, partial
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
@@ -27,6 +30,7 @@ from pydrake.systems.primitives import Demultiplexer, RandomSource
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
     apply_matrix,
     copy_into,
@@ -36,21 +40,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.load.regressor import (
-    FIRST_JOINT_INDEX,
-    LOST_SAMPLE_FLAG,
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_JOINT_POSITION,
-    SAMPLE_MOTION,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
-    SAMPLE_WRENCH_AND_MOTION,
-    SATURATION_FLAG_INDEX,
-    non_contact_wrench_into,
-    sample_size,
-    signals_of_sample,
-)
+from drake_teleop.load import regressor
 from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -61,7 +51,6 @@ from drake_teleop.station.sensor.sensor_chain import (
     FILTER_MEMORY_START,
     LOST_READING_FLAG_SAMPLES,
     NOISE_BLOCK_SIZE,
-    OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
     TRUE_JOINT_ANGLES,
     WristSensorConfig,
@@ -87,8 +76,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     plant_rates_under_wrench,
     tool_proximity,
 )
-
-Array = NDArray[np.float64]
+from drake_teleop.station.wiring import connect_inputs
 
 #: Tolerance of equal instants, in periods.
 _EQUAL_TIME_TOLERANCE_PERIODS = 1e-6
@@ -109,12 +97,12 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
-    s = out[SAMPLE_SPECIFIC_FORCE]
-    omega = out[SAMPLE_ANGULAR_VELOCITY]
-    alpha = out[SAMPLE_ANGULAR_ACCELERATION]
-    wrench = out[SAMPLE_WRENCH]
-    non_contact_wrench_into(s, omega, alpha, phi, wrench)
+    copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
+    s = out[regressor.SAMPLE_SPECIFIC_FORCE]
+    omega = out[regressor.SAMPLE_ANGULAR_VELOCITY]
+    alpha = out[regressor.SAMPLE_ANGULAR_ACCELERATION]
+    wrench = out[regressor.SAMPLE_WRENCH]
+    regressor.non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
     tau = minus(vector_at(contact_W, 3), cross(p_WS, f))
@@ -146,26 +134,28 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[SAMPLE_WRENCH_AND_MOTION]
+    rigid = truth[regressor.SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(SENSOR_MOTION_SIZE), rigid)
     copy_into(truth, TRUE_JOINT_ANGLES.start, x, 0, n)
-    size = FIRST_JOINT_INDEX + n
+    size = regressor.FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
     if not are_values_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        sample[regressor.SATURATION_FLAG_INDEX] = (
+            regressor.LOST_SAMPLE_FLAG + LOST_READING_FLAG_SAMPLES
+        )
         return
-    lost = sample[SATURATION_FLAG_INDEX] - 1.0
+    lost = sample[regressor.SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
-        sample[SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
+        copy_into(sample, 0, truth, 0, regressor.SAMPLE_WRENCH_AND_MOTION.stop)
+        sample[regressor.SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, regressor.SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
         estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= LOST_SAMPLE_FLAG:
-        sample[SATURATION_FLAG_INDEX] = lost
+    if lost >= regressor.LOST_SAMPLE_FLAG:
+        sample[regressor.SATURATION_FLAG_INDEX] = lost
 
 
 @njit(cache=True)
@@ -217,7 +207,7 @@ def take_due_samples(
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
-    size, half, tau, joints = FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
+    size, half, tau, joints = regressor.FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
     extra = around.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
@@ -309,7 +299,6 @@ class WristSensor(LeafSystem):
         motion: MotionEstimationConfig,
         period: float,
         held: float,
-        q_start: Array,
         *,
         ramps: bool = False,
     ) -> None:
@@ -321,11 +310,11 @@ class WristSensor(LeafSystem):
         self._physics, contact = slave.physics_of_plant, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
-        self.offset, self.phi = constants[OFFSET_CONSTANTS], self._physics[1]
+        self.offset, self.phi = constants.offset[:6], self._physics[1]
         self.contact_pairs = self._physics[2]
-        first = sample_at_rest(arm, q_start)
+        first = sample_at_rest(arm, slave.start)
         if not config.ideal:
-            first[SAMPLE_WRENCH] += config.offset
+            first[regressor.SAMPLE_WRENCH] += config.offset
         #: Reason why contact is outside the compiled contact law, or "".
         self.reason_beyond_contact_law = contact.drake_contact_reason
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
@@ -344,8 +333,8 @@ class WristSensor(LeafSystem):
         #: Sentence that names the moving bodies around the arm except a sheet spring, or "".
         moving = contact.moving_bodies
         self.moving_bodies_sentence = ", ".join(moving) + " can move" * bool(moving)
-        self._twin_arguments = slave.config, slave.environment, slave.start
-        self._twin: ContactPlantCopy | None = None
+        copy = partial(ContactPlantCopy, slave.config, slave.environment, slave.start)
+        self._twin = cache(copy)  # made at its first use
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
@@ -393,9 +382,9 @@ class WristSensor(LeafSystem):
     def motion_dependent_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
-        size = sample_size(self._n)
+        size = regressor.sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTER_MEMORY_START)
-        others = [SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
+        others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
@@ -461,25 +450,15 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        inputs = (
-            self._physics,
-            self._sensor,
-            self._period,
-            context.get_time(),
-            *seen,
-            (
-                self._torque.Eval(context),
-                self._no_rate if self._rate is None else self._rate.Eval(context),
-            ),
-            self._evaluate_applied_wrench(context),
-            self._no_noise if self._noise is None else self._noise.Eval(context),
-            context.get_discrete_state_vector().value(),
-        )
+        rate = self._no_rate if self._rate is None else self._rate.Eval(context)
+        held, applied = (self._torque.Eval(context), rate), self._evaluate_applied_wrench(context)
+        noise = self._no_noise if self._noise is None else self._noise.Eval(context)
+        memory = context.get_discrete_state_vector().value()
+        constants = self._physics, self._sensor, self._period
+        inputs = (*constants, context.get_time(), *seen, held, applied, noise, memory)
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
-        if self._twin is None:
-            self._twin = ContactPlantCopy(*self._twin_arguments)
         own = 2 * self._n + 2
         size = own + self._plant_size
         told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
@@ -491,7 +470,7 @@ class WristSensor(LeafSystem):
             if told[0, 1] <= k:
                 return
             asked = told[0, 2:]
-            told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
+            told[1 + k, :6] = self._twin().wrench_W(asked[:own], asked[own:])
 
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
@@ -537,12 +516,12 @@ class WristSensor(LeafSystem):
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
-    sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
+    sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
     touching = np.zeros(6)
     motion = np.zeros(SENSOR_MOTION_SIZE)
-    truth = sample[SAMPLE_WRENCH_AND_MOTION]
+    truth = sample[regressor.SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
-    sample[SAMPLE_JOINT_POSITION] = q
+    sample[regressor.SAMPLE_JOINT_POSITION] = q
     return sample
 
 
@@ -553,30 +532,22 @@ def AddCompiledWristSensor(
     motion: MotionEstimationConfig,
     period: float,
     held: float,
-    q_start: Array,
-    *,
-    ramps: bool = False,
+    torque: Mapping[str, OutputPort],
 ) -> dict[str, OutputPort]:
     """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
-    The caller must connect state, acceleration and torque of the arm.
+    `torque` contains the ports of the joint control: `joint_torque`, and `torque_rate` if it ramps.
     """
-    sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
+    sensor = WristSensor(slave, config, motion, period, held, ramps="torque_rate" in torque)
     builder.AddNamedSystem("wrist_sensor", sensor)
+    connect_inputs(builder, sensor, slave.ports)
+    connect_inputs(builder, sensor, torque)
     if not config.ideal:
         block_s = SAMPLES_PER_NOISE_BLOCK * period
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    if slave.compiled_sheet_instance is not None:
-        sheet = slave.plant.get_state_output_port(slave.compiled_sheet_instance)
-        builder.Connect(sheet, sensor.GetInputPort("sheet_state"))
-    if slave.contact.plant_state_size:
-        builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
-    if slave.can_touch:
-        results = slave.plant.get_contact_results_output_port()
-        builder.Connect(results, sensor.GetInputPort("contact_results"))
-    parts = signals_of_sample(slave.arm.num_joints)
+    parts = regressor.signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)

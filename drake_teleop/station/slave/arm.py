@@ -34,15 +34,8 @@ from drake_teleop.common.vectors import (
 from drake_teleop.station.slave.joint_friction import dry_friction
 
 # Columns of ArmModel.table.
-(
-    ROTATION_COLUMN,
-    TRANSLATION_COLUMN,
-    PHI_COLUMN,
-    ROTOR_COLUMN,
-    DAMPING_COLUMN,
-    DRY_FRICTION_COLUMN,
-    IS_PRISMATIC_COLUMN,
-) = 0, 9, 12, 22, 23, 24, 25
+ROTATION_COLUMN, TRANSLATION_COLUMN, PHI_COLUMN, ROTOR_COLUMN = 0, 9, 12, 22
+DAMPING_COLUMN, DRY_FRICTION_COLUMN, IS_PRISMATIC_COLUMN = 23, 24, 25
 NUM_TABLE_COLUMNS = 26
 # First of three columns with gravity, in the last row only.
 LAST_ROW_GRAVITY_COLUMN = 22
@@ -250,11 +243,8 @@ def _write_joint_axis_and_link_wrench(table: Array, row: int, x: Array, link: Ar
     """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
-    s, omega, alpha = (
-        apply_matrix(R_LW, vector_at(x, 0)),
-        apply_matrix(R_LW, vector_at(x, 3)),
-        apply_matrix(R_LW, vector_at(x, 6)),
-    )
+    s, omega = apply_matrix(R_LW, vector_at(x, 0)), apply_matrix(R_LW, vector_at(x, 3))
+    alpha = apply_matrix(R_LW, vector_at(x, 6))
     f = add_cross_product(add_cross_product(scale_vector(m, s), alpha, h), omega, cross(omega, h))
     tau = add_cross_product(apply_matrix(inertia, alpha), omega, apply_matrix(inertia, omega))
     tau = add_cross_product(tau, h, s)
@@ -317,11 +307,8 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add inertial parameters phi (10,) of a link about Wo, in W, to `inertia` (10,)."""
     phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
-    m, h, about_Lo = (
-        phi[0],
-        apply_matrix(matrix_at(x, 12), vector_at(phi, 1)),
-        symmetric_matrix_at(phi, 4),
-    )
+    h = apply_matrix(matrix_at(x, 12), vector_at(phi, 1))
+    m, about_Lo = phi[0], symmetric_matrix_at(phi, 4)
     inertia[0] += m
     add_into(inertia, 1, plus(h, scale_vector(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')

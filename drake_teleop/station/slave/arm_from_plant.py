@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,6 @@ from pydrake.multibody.tree import (
     BodyIndex,
     Frame,
     Joint,
-    JointActuator,
     ModelInstanceIndex,
     PrismaticJoint,
     RevoluteJoint,
@@ -46,9 +47,7 @@ _DEFAULT_TIME_TO_SPEED_LIMIT_S = 0.4
 
 
 def ArmModelFromPlant(
-    plant: MultibodyPlant,
-    model_instance: ModelInstanceIndex,
-    sensor_frame_name: str = "sensor",
+    plant: MultibodyPlant, model_instance: ModelInstanceIndex, sensor_frame_name: str = "sensor"
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 
@@ -66,10 +65,13 @@ def ArmModelFromPlant(
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
     joints = _moving_joints_to_sensor(inboard_joints, frame_S)
+    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
+    efforts = [min((motor.effort_limit() for motor in each), default=np.inf) for each in motors]
     n = len(joints)
     table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
-        table[row, ROTOR_COLUMN] = _reflected_rotor_inertia(plant, joint)
+        table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
         table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
@@ -107,7 +109,7 @@ def ArmModelFromPlant(
         upper=upper,
         velocity_limit=np.array([j.velocity_upper_limits()[0] for j in joints]),
         acceleration_limit=np.array([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=np.array([_effort_limit(plant, j) for j in joints]),
+        effort_limit=np.array(efforts),
         position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
         velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
     )
@@ -139,18 +141,14 @@ def _moving_joints_to_sensor(
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
-            raise DrakeTeleopError(
-                f"the arm up to the sensor contains an unsupported {joint.type_name()} joint",
-                where=joint.name(),
-                remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
-            )
+            what = f"the arm up to the sensor contains an unsupported {joint.type_name()} joint"
+            remedy = "weld the arm's base to the world; up to the sensor, use joints of one axis"
+            raise DrakeTeleopError(what, where=joint.name(), remedy=remedy)
         body = joint.parent_body()
     if not joints:
-        raise DrakeTeleopError(
-            f"no moving joint is between the world and {frame_S.name()}",
-            where="sensor_frame",
-            remedy="name a frame or link that the arm moves",
-        )
+        what = f"no moving joint is between the world and {frame_S.name()}"
+        remedy = "name a frame or link that the arm moves"
+        raise DrakeTeleopError(what, where="sensor_frame", remedy=remedy)
     return joints[::-1]
 
 
@@ -174,11 +172,8 @@ def _table_row_of_body(
             moving = joint
         body = joint.parent_body()
     if moving is not None:
-        raise DrakeTeleopError(
-            f"the joint moves on link {body.name()}, but is not between the world and the sensor",
-            where=moving.name(),
-            remedy="weld that joint",
-        )
+        what = f"the joint moves on link {body.name()}, but is not between the world and the sensor"
+        raise DrakeTeleopError(what, where=moving.name(), remedy="weld that joint")
     return rows[body.index()]
 
 
@@ -189,17 +184,17 @@ def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Arr
     return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
 
 
-def _actuators_of_joint(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
-    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    return [a for a in actuators if a.joint().index() == joint.index()]
-
-
-def _reflected_rotor_inertia(plant: MultibodyPlant, joint: Joint) -> float:
-    return sum(a.default_reflected_inertia() for a in _actuators_of_joint(plant, joint))
-
-
-def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
-    return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
+def values_per_joint(
+    arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
+) -> Array:
+    """Return n values from n values or, with a default for none, from one for all joints."""
+    n = arm.num_joints
+    if len(values) not in ((n,) if default is None else (0, 1, n)):
+        one = "" if default is None else "one for all, or "
+        what = f"has {len(values)} numbers, but the arm has {n} joints"
+        remedy = f"give {one}{n}, for {', '.join(arm.joint_names)}"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
+    return np.broadcast_to(np.array(values if len(values) else default, float), (n,)).copy()
 
 
 def fill_missing_joint_limits(
@@ -210,7 +205,7 @@ def fill_missing_joint_limits(
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
     about accelerations.
     """
-    n, assumptions = arm.num_joints, []
+    assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
     unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_joint_position_limits`
@@ -228,32 +223,21 @@ def fill_missing_joint_limits(
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
     width = np.where(slides, 2 * reach, 2 * np.pi)
-    lower, upper = (
-        np.where(half_limited & np.isinf(lower), upper - width, lower),
-        np.where(half_limited & np.isinf(upper), lower + width, upper),
-    )
+    lowest = np.where(half_limited & np.isinf(lower), upper - width, lower)
+    lower, upper = lowest, np.where(half_limited & np.isinf(upper), lower + width, upper)
     speed = np.where(slides, _DEFAULT_SPEED_LIMIT_M_S, _DEFAULT_SPEED_LIMIT_RAD_S)
     velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
-    specified = arm.acceleration_limit
-    if acceleration:
-        if len(acceleration) not in (1, n):
-            raise DrakeTeleopError(
-                f"{len(acceleration)} acceleration limits, but {n} joints",
-                where=where,
-                remedy="give one for all joints or one for each",
-            )
-        specified = np.broadcast_to(np.array(acceleration), n).copy()
-    completed = replace(
-        arm,
-        lower=lower,
-        upper=upper,
-        velocity_limit=velocity,
-        acceleration_limit=np.where(
-            _is_positive_and_finite(specified), specified, velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
-        ),
-        effort_limit=effort,
-    )
+    place = f"{where}: acceleration"
+    specified = values_per_joint(arm, acceleration, place, arm.acceleration_limit)
+    default = velocity / _DEFAULT_TIME_TO_SPEED_LIMIT_S
+    reached = np.where(_is_positive_and_finite(specified), specified, default)
+    limits: Any = {
+        "velocity_limit": velocity,
+        "acceleration_limit": reached,
+        "effort_limit": effort,
+    }
+    completed = replace(arm, lower=lower, upper=upper, **limits)
     plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_RANGE_RAD)
     acceleration_text = (
         f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"

@@ -42,25 +42,21 @@ def check_joints_form_tree(plant: MultibodyPlant, where: str) -> None:
         child = joint.child_body()
         if child.index() in parents or child.index() == world:
             other = parents.get(child.index())
-            parents_text = (
-                joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
-            )
-            raise DrakeTeleopError(
-                f"link {child.name()} is the child of {parents_text}",
-                where=where,
-                remedy="an arm is a tree: make each link the child of one joint, the world of none",
-            )
+            parents_text = joint.name()
+            if other is not None:
+                parents_text = f"two joints, {other.name()} and {joint.name()}"
+            what = f"link {child.name()} is the child of {parents_text}"
+            remedy = "an arm is a tree: make each link the child of one joint, the world of none"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         parents[child.index()] = joint
     for start in parents:
         index, passed = start, {start}
         while index in parents:
             index = parents[index].parent_body().index()
             if index in passed:
-                raise DrakeTeleopError(
-                    f"its joints form a loop through {plant.get_body(index).name()}",
-                    where=where,
-                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
-                )
+                what = f"its joints form a loop through {plant.get_body(index).name()}"
+                remedy = "an arm is a tree: cut the loop, or model the chain to the sensor alone"
+                raise DrakeTeleopError(what, where=where, remedy=remedy)
             passed.add(index)
 
 
@@ -80,11 +76,9 @@ def weld_base_and_find_chain(
         X_WB = RigidTransform() if X_WBase is None else X_WBase
         plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
     elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
-        raise DrakeTeleopError(
-            f"the model already welds its base {chain[-1].child_body().name()} to the world",
-            where=where,
-            remedy="leave slave.base_pose out, or remove that joint from the model",
-        )
+        what = f"the model already welds its base {chain[-1].child_body().name()} to the world"
+        remedy = "leave slave.base_pose out, or remove that joint from the model"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     return [joint.index() for joint in reversed(chain)]
 
 
@@ -107,18 +101,14 @@ def check_chain(
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependence_reasons:
-                raise DrakeTeleopError(
-                    f"{name} {dependence_reasons[name]}",
-                    where=where,
-                    remedy="the arm up to the sensor has to be a chain of independent joints",
-                )
+                what = f"{name} {dependence_reasons[name]}"
+                remedy = "the arm up to the sensor has to be a chain of independent joints"
+                raise DrakeTeleopError(what, where=where, remedy=remedy)
         one_axis = isinstance(joint, (RevoluteJoint, PrismaticJoint))
         if joint.num_velocities() > 0 and not one_axis:
-            raise DrakeTeleopError(
-                f"{joint.name()} is a {joint.type_name()} joint, which has several axes",
-                where=where,
-                remedy="up to the sensor, use joints that turn about one axis or slide along it",
-            )
+            what = f"{joint.name()} is a {joint.type_name()} joint, which has several axes"
+            remedy = "up to the sensor, use joints that turn about one axis or slide along it"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def weld_held_joints(
@@ -131,11 +121,9 @@ def weld_held_joints(
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:
-            raise DrakeTeleopError(
-                f"the model has no moving joint {name!r}",
-                where="slave.hold",
-                remedy=f"name one of {', '.join(sorted(known))}",
-            )
+            what = f"the model has no moving joint {name!r}"
+            remedy = f"name one of {', '.join(sorted(known))}"
+            raise DrakeTeleopError(what, where="slave.hold", remedy=remedy)
         if joint.num_velocities() != 1:
             what = f"{name} is a {joint.type_name()} joint, which has no single position"
             raise DrakeTeleopError(what, where="slave.hold", remedy="leave it out")
@@ -217,11 +205,9 @@ def set_torque_limits(
     known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
     for name, limit in limits.items():
         if name not in known:
-            raise DrakeTeleopError(
-                f"the arm has no joint {name!r}",
-                where="slave.torque_limits",
-                remedy=f"name one of {', '.join(known)}",
-            )
+            what = f"the arm has no joint {name!r}"
+            remedy = f"name one of {', '.join(known)}"
+            raise DrakeTeleopError(what, where="slave.torque_limits", remedy=remedy)
         known[name].set_effort_limit(limit)
 
 
@@ -246,14 +232,12 @@ def assume_rotor_inertias(
         (sliding if slides else turning).append(joint.name())
         motor[joint.index()].set_default_rotor_inertia(_SLIDER_DRIVE_MASS_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
-    return [
-        f"{what}, as the model has no inertia there, for {join_names(names)}"
-        for what, names in (
-            (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
-            (f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg", sliding),
-        )
-        if names
-    ]
+    notes = {
+        f"a rotor inertia of {inertia:.3g} kg m^2": turning,
+        f"a moved mass of {_SLIDER_DRIVE_MASS_KG:g} kg": sliding,
+    }
+    reason = "as the model has no inertia there"
+    return [f"{what}, {reason}, for {join_names(names)}" for what, names in notes.items() if names]
 
 
 def _carries_inertia(plant: MultibodyPlant, joint: Joint, auxiliary_bodies: frozenset[str]) -> bool:

@@ -10,6 +10,7 @@ from pydrake.math import RotationMatrix
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, holding_torque
+from drake_teleop.station.slave.arm_from_plant import values_per_joint
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -49,24 +50,15 @@ def home_posture(arm: ArmModel, position: list[float]) -> Array:
     else:
         remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
-        raise DrakeTeleopError(
-            f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
-            where="slave.position",
-            remedy=remedy,
-        )
+        what = f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})"
+        raise DrakeTeleopError(what, where="slave.position", remedy=remedy)
     return q
 
 
 def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     if not slave.home:
         return home_posture(arm, slave.position)
-    if len(slave.home) != arm.num_joints:
-        raise DrakeTeleopError(
-            f"{len(slave.home)} joint positions are given for {arm.num_joints} joints",
-            where="slave.home",
-            remedy=f"give one for each of {', '.join(arm.joint_names)}",
-        )
-    q = np.array(slave.home, dtype=np.float64)
+    q = values_per_joint(arm, slave.home, "slave.home")
     outside = (q < arm.lower) | (q > arm.upper)
     if outside.any():
         k = int(outside.argmax())
@@ -82,11 +74,9 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
 def check_holding_torque(arm: ArmModel, q: Array) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
-        raise DrakeTeleopError(
-            "the mass matrix is singular: the links have too little inertia",
-            where="slave.model",
-            remedy="give masses and inertias of the links, or rotor inertias of the joints",
-        )
+        what = "the mass matrix is singular: the links have too little inertia"
+        remedy = "give masses and inertias of the links, or rotor inertias of the joints"
+        raise DrakeTeleopError(what, where="slave.model", remedy=remedy)
     torque = holding_torque(arm, q)
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())

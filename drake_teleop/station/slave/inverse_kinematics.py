@@ -253,14 +253,9 @@ class InverseKinematics(LeafSystem):
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status), inputs)
 
     def _solve_command(self, context: Context, q: np.ndarray) -> int:
-        return solve_pose_command(
-            self._pose.Eval(context),
-            self._position.Eval(context),
-            self._lower,
-            self._upper,
-            self.MAX_JOINT_JUMP_RAD,
-            q,
-        )
+        inputs = self._pose.Eval(context), self._position.Eval(context)
+        limits = self._lower, self._upper, self.MAX_JOINT_JUMP_RAD
+        return solve_pose_command(*inputs, *limits, q)
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         self._solve_command(context, output.get_mutable_value())

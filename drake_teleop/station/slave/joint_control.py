@@ -1,9 +1,6 @@
 """Joint control of the slave: computed torque with position and velocity loop (paper, VI-A)."""
 
-import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -35,12 +32,8 @@ COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 class JointControlConfig:
     """Settings of the slave's joint control: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(
-        12.0, "Hz", 0.1, 1e4, "bandwidth of the position loop (E)"
-    )
-    velocity_bandwidth_hz: float = quantity(
-        70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
-    )
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position loop bandwidth (E)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity loop bandwidth (E)")
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
         (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACES, "position"),
@@ -66,21 +59,16 @@ class JointControlConfig:
     @property
     def position_loop_gain_per_s(self) -> float:
         """Commanded joint speed divided by the position error [1/s]."""
-        interface = self.position_interface
-        return (
-            2 * np.pi * self.position_bandwidth_hz
-            if interface is None
-            else 1 / self.tracking_delay_s
-        )
+        if self.position_interface is None:
+            return 2 * np.pi * self.position_bandwidth_hz
+        return 1 / self.tracking_delay_s
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE_SERVO_NAME and self.interface is not None:
-            raise DrakeTeleopError(
-                "the servo computed_torque has bandwidths, but no position interface",
-                where=f"{where}.interface",
-                remedy="leave it out, or choose another servo, such as position",
-            )
+            what = "the servo computed_torque has bandwidths, but no position interface"
+            remedy = "leave it out, or choose another servo, such as position"
+            raise DrakeTeleopError(what, where=f"{where}.interface", remedy=remedy)
         interface = self.position_interface
         if interface is not None:
             interface.check(f"{where}.interface", rate)
@@ -154,11 +142,7 @@ class JointControl(LeafSystem):
     __slots__ = ONE_DICT
 
     def __init__(
-        self,
-        arm: ArmModel,
-        config: JointControlConfig,
-        period: float,
-        q_start: Array,
+        self, arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
     ) -> None:
         super().__init__()
         n = arm.num_joints
@@ -171,13 +155,9 @@ class JointControl(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        computed_torque_into(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            *self._constants,
-            discrete_state.get_mutable_value(0),
-        )
+        inputs = self._command.Eval(context), self._state.Eval(context)
+        torque = discrete_state.get_mutable_value(0)
+        computed_torque_into(self._arm, *inputs, *self._constants, torque)
 
 
 class HeldTorque(LeafSystem):
@@ -212,11 +192,6 @@ def MakeJointControl(
     return PositionServo(arm, interface, period, q_start)
 
 
-def position_interface_of_servo(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the position interface that `servo` in a `joint_control` block names, or None."""
-    return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
-
-
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
     """Return the mass matrix M(q) (n, n) of the arm with rotors and tool."""
     zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
@@ -244,32 +219,19 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
     return np.linalg.inv(J @ mobility @ J.T)
 
 
-class ServoAtTool(NamedTuple):
-    """Joint servo as an equivalent wrench at the tool, K (x_command - x) - D v.
+def servo_at_tool(
+    arm: ArmModel, q: Array, config: JointControlConfig
+) -> tuple[list[float], list[float], list[float]]:
+    """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
 
-    Attributes:
-        stiffness: (2,) K of translation and rotation [N/m, N m/rad].
-        damping: (2,) D of translation and rotation [N s/m, N m s/rad].
-        mass: (2,) mass and inertia of arm and tool [kg, kg m^2].
-    """
-
-    stiffness: list[float]
-    damping: list[float]
-    mass: list[float]
-
-
-def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
-    """Return stiffness, damping and mass of the slave at the tool, for the passivity methods.
-
-    Mass m and inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is
-    that of the largest eigenvalues of its two blocks, their size the smallest possible.
+    The servo is then the wrench K (x_command - x) - D v, for translation and rotation. Mass m and
+    inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is that of the
+    largest eigenvalues of its two blocks, their size the smallest possible.
     """
     config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)
     blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
     unit = 1 / np.sqrt(np.repeat(blocks, 3))
     mass = np.linalg.eigvalsh(unit[:, np.newaxis] * inertia * unit)[-1] * np.array(blocks)
-    kp, kv = (
-        2 * np.pi * hertz for hertz in (config.position_bandwidth_hz, config.velocity_bandwidth_hz)
-    )
-    return ServoAtTool((kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist())
+    kp, kv, *_ = servo_gains_and_limits(arm, config)
+    return (kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist()

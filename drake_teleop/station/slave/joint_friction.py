@@ -10,7 +10,6 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
 FRICTION_TANH_SPEED = 2e-3
@@ -29,18 +28,6 @@ def _friction_into(coulomb, index, state, force):
     force[:] = 0.0
     for i in range(n):
         force[index[i]] = dry_friction(coulomb[i], state[n + i])
-
-
-def expand_friction_per_joint(values: list[float], joints: tuple[str, ...]) -> Array:
-    """Return friction torques (n,) [N m] from 0, 1 or n values, else raise DrakeTeleopError."""
-    n = len(joints)
-    if len(values) not in (0, 1, n):
-        raise DrakeTeleopError(
-            f"has {len(values)} numbers, but the arm has {n} joints",
-            where="slave.friction",
-            remedy=f"give one for all, or {n}, for {', '.join(joints)}",
-        )
-    return np.broadcast_to(np.array(values or 0.0, np.float64), (n,)).copy()
 
 
 class JointFriction(LeafSystem):

@@ -27,7 +27,7 @@ from drake_teleop.station.slave.drake_errors import (
 )
 from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import RepairedModel
+from drake_teleop.station.slave.model.repair_report import RepairedModel, merge_repaired_models
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
 
@@ -40,15 +40,12 @@ class ModelInPlant(NamedTuple):
     """Content of a model file that was added to a plant.
 
     Attributes:
-        effort_limits: limits by joint, unlimited without an entry; None: those of the actuators.
+        repaired: reports of the repair, with text "" if a part of the model was not repaired.
         mesh_folder: folder of converted meshes, which Drake reads later.
     """
 
     instances: list[ModelInstanceIndex]
-    assumptions: list[str]
-    effort_limits: dict[str, float] | None
-    dependence_reasons: dict[str, str]
-    auxiliary_bodies: frozenset[str]
+    repaired: RepairedModel
     mesh_folder: TemporaryDirectory[str]
 
 
@@ -76,33 +73,20 @@ def repair_and_parse_model(
     expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     with translate_drake_errors(path, expected, folder.name):
         read = _add_files_of_directives if kind == ".yaml" else _add_repaired_file
-        instances, repaired = read(parser, path, files, purpose, folder)
+        instances, repaired = read(parser, path, files, purpose, Path(folder.name))
         check_joints_form_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
-        raise DrakeTeleopError(
-            "the model has springs or other force elements, which are not supported",
-            where=str(path),
-            remedy="remove them; only motors, gravity and contact move the arm",
-        )
-    is_complete = all(each.text for each in repaired)
-    return ModelInPlant(
-        instances,
-        list(dict.fromkeys(text for each in repaired for text in each.assumptions)),
-        {n: x for each in repaired for n, x in each.effort_limits.items()} if is_complete else None,
-        {name: why for each in repaired for name, why in each.dependence_reasons.items()},
-        frozenset(name for each in repaired for name in each.auxiliary_bodies),
-        folder,
-    )
+        what = "the model has springs or other force elements, which are not supported"
+        remedy = "remove them; only motors, gravity and contact move the arm"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
+    text = "".join(each.text for each in repaired) if all(e.text for e in repaired) else ""
+    return ModelInPlant(instances, merge_repaired_models(text, repaired), folder)
 
 
 def _add_repaired_file(
-    parser: Parser,
-    path: Path,
-    files: ModelFiles,
-    purpose: ModelPurpose,
-    folder: TemporaryDirectory[str],
+    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    repaired = _repair_file(path, files, purpose, Path(folder.name))
+    repaired = _repair_file(path, files, purpose, folder)
     with raise_logged_errors():
         if repaired.text:
             kind = path.suffix.lower().removeprefix(".")
@@ -113,11 +97,7 @@ def _add_repaired_file(
 
 
 def _add_files_of_directives(
-    parser: Parser,
-    path: Path,
-    files: ModelFiles,
-    purpose: ModelPurpose,
-    folder: TemporaryDirectory[str],
+    parser: Parser, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
@@ -127,9 +107,9 @@ def _add_files_of_directives(
         if file is None:
             continue  # Drake reports it
         if file not in repaired:
-            repaired[file] = _repair_file(file, files, purpose, Path(folder.name))
+            repaired[file] = _repair_file(file, files, purpose, folder)
         if repaired[file].text:
-            copy = Path(folder.name) / f"{len(repaired)}_{file.name}"
+            copy = folder / f"{len(repaired)}_{file.name}"
             copy.write_text(repaired[file].text, encoding="utf-8")
             added.file = f"file://{copy}"
     with raise_logged_errors():

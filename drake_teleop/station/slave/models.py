@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,10 +22,9 @@ from drake_teleop.station.slave.chain_joints import (
     weld_joints_outside_chain,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.model.repair_report import describe_frame_fault
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 from drake_teleop.station.slave.model_files import repair_and_parse_model
-
-_MAX_SUGGESTED_FRAME_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
@@ -68,22 +66,21 @@ def ParseModel(
     added = set(plant.GetJointIndices()) - before
     held = weld_held_joints(plant, hold, added)
     chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
-    check_chain(plant, chain, read.dependence_reasons, where)
+    check_chain(plant, chain, read.repaired.dependence_reasons, where)
     free = weld_free_bodies(plant, read.instances)
     with translate_drake_errors(path):
         held += weld_joints_outside_chain(plant, before, chain)
-        set_one_actuator_per_joint(plant, chain, read.effort_limits)
-        rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary_bodies)
+        limits = read.repaired.effort_limits if read.repaired.text else None
+        set_one_actuator_per_joint(plant, chain, limits)
+        rotors = assume_rotor_inertias(plant, chain, frame, read.repaired.auxiliary_bodies)
     instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
-        raise DrakeTeleopError(
-            f"the joints up to the sensor belong to several models, {', '.join(names)}",
-            where=where,
-            remedy="write the chain up to the sensor as one model",
-        )
+        what = f"the joints up to the sensor belong to several models, {', '.join(names)}"
+        remedy = "write the chain up to the sensor as one model"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     instance = next(iter(instances), frame.model_instance())
-    assumptions = [*read.assumptions, *free, *held, *rotors]
+    assumptions = [*read.repaired.assumptions, *free, *held, *rotors]
     return ParsedModel(instance, frame, assumptions, read.mesh_folder)
 
 
@@ -98,13 +95,11 @@ def ParseTool(
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
         names = ", ".join(body.name() for body in roots) or "none"
-        raise DrakeTeleopError(
-            f"the tool must have one root link, but has {len(roots)}: {names}",
-            where=str(path),
-            remedy="give one tree of links; its root is welded to the sensor frame",
-        )
+        what = f"the tool must have one root link, but has {len(roots)}: {names}"
+        remedy = "give one tree of links; its root is welded to the sensor frame"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     with translate_drake_errors(path):
-        assumptions = [*read.assumptions, *weld_joints_outside_chain(plant, before, [])]
+        assumptions = [*read.repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     return ParsedTool(roots[0], assumptions, read.mesh_folder)
@@ -113,12 +108,9 @@ def ParseTool(
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """Parse the surroundings of an arm; return the folder of their converted meshes."""
     read = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
-    for name, what in read.dependence_reasons.items():
-        raise DrakeTeleopError(
-            f"{name} {what}",
-            where=str(path),
-            remedy="correct it; every object that the tool could touch must be readable",
-        )
+    for name, what in read.repaired.dependence_reasons.items():
+        remedy = "correct it; every object that the tool could touch must be readable"
+        raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
     return read.mesh_folder
 
 
@@ -131,11 +123,6 @@ def _find_sensor_frame(
     names = {plant.get_frame(k).name() for each in instances for k in plant.GetFrameIndices(each)}
     # Without names that Drake creates for joints.
     ends = ("_parent", "_child", "__model__")
-    named = sorted(each for each in names if not each.endswith(ends))
-    nearest = difflib.get_close_matches(name, named, n=_MAX_SUGGESTED_FRAME_NAMES, cutoff=0.0)
-    known = ", ".join(sorted(nearest))
-    raise DrakeTeleopError(
-        f"{len(with_frame) or 'no'} frames are named {name!r}",
-        where=where,
-        remedy=f"name one of {known}" if known else "give a model that has links",
-    )
+    named = {each for each in names if not each.endswith(ends)}
+    what, remedy = describe_frame_fault(len(with_frame), name, named)
+    raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -58,15 +58,8 @@ _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.
 # Triple product of the last three axes below which the wrist is singular.
 _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT = 0.1
 
-(
-    _STATUS_OK,
-    _WRIST_SINGULAR,
-    _SHOULDER_SINGULAR,
-    _OUT_OF_REACH,
-    _JOINT_LIMIT,
-    _BAD_POSE,
-    _SPEED_LIMIT,
-) = map(int, IkStatus)
+_STATUS_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, *_others = map(int, IkStatus)
+_JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -26,18 +26,18 @@ from drake_teleop.station.slave.arm_from_plant import (
     ArmModelFromPlant,
     check_arm_lengths,
     fill_missing_joint_limits,
+    values_per_joint,
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.home import R_WS_HOME, check_holding_torque, find_start_posture
-from drake_teleop.station.slave.joint_friction import JointFriction, expand_friction_per_joint
+from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
     ToolContactModel,
-    make_empty_contact_model,
 )
 from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
@@ -90,8 +90,20 @@ class SlavePlant:
         return carried.table, carried.phi_load_view, *laws, no_wrenches
 
     @property
+    def ports(self) -> dict[str, OutputPort]:
+        """Output ports of the plant by the names of the input ports of other blocks."""
+        plant, leaf = self.plant, self.contact.leaf_instance
+        ports = {
+            "slave_state": plant.get_state_output_port(self.instance),
+            "slave_acceleration": plant.get_generalized_acceleration_output_port(self.instance),
+            "plant_state": plant.get_state_output_port(),
+            "contact_results": plant.get_contact_results_output_port(),
+        }
+        return ports if leaf is None else ports | {"sheet_state": plant.get_state_output_port(leaf)}
+
+    @property
     def joint_friction(self) -> Array:
-        return expand_friction_per_joint(self.config.friction, self.arm.joint_names)
+        return values_per_joint(self.arm, self.config.friction, "slave.friction", 0.0)
 
     @property
     def can_touch(self) -> bool:
@@ -118,15 +130,15 @@ def start_pose(slave: Slave) -> Array:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _cached_nominal_slave(HashableByValue(slave), written)
+    return _cached_nominal_slave(HashableByValue(slave, slave.model_files()))
 
 
 class HashableByValue:
-    """Hashable copy of settings, equal to copies with equal values."""
+    """Hashable copy of settings, equal to copies with equal values and unchanged files."""
 
-    def __init__(self, value: Any) -> None:
-        self.value, self._values = copy.deepcopy(value), repr(value)
+    def __init__(self, value: Any, files: list[Path]) -> None:
+        written = [path.stat().st_mtime_ns for path in files]
+        self.value, self._values = copy.deepcopy(value), repr((value, written))
 
     def __hash__(self) -> int:
         return hash(self._values)
@@ -136,7 +148,7 @@ class HashableByValue:
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _cached_nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
+def _cached_nominal_slave(key: HashableByValue) -> SlavePlant:
     return AddSlavePlant(DiagramBuilder(), key.value, None)
 
 
@@ -163,7 +175,7 @@ def AddSlavePlant(
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
         finalize_plant(plant)
-    contact = make_empty_contact_model()
+    contact = ToolContactModel()
     if environment is not None and surroundings is not None:
         _remove_visual_shapes(plant, scene_graph)
         frame = parsed.sensor_frame
@@ -173,7 +185,7 @@ def AddSlavePlant(
     start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         check_holding_torque(arm, start)
-    friction = expand_friction_per_joint(slave.friction, arm.joint_names)
+    friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
         block = builder.AddNamedSystem("joint_friction", law)
@@ -185,20 +197,9 @@ def AddSlavePlant(
     X_WS_start = np.empty(7) if slave.home else start_pose(slave)
     if slave.home:
         pose_into(arm.table, start, X_WS_start)
-    return SlavePlant(
-        plant,
-        instance,
-        parsed.sensor_frame,
-        tool,
-        arm,
-        start,
-        X_WS_start,
-        _tip_of_tool(plant, slave, parsed, arm),
-        contact,
-        (*parsed.assumptions, *assumptions),
-        slave,
-        environment,
-    )
+    tip, texts = _tip_of_tool(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
+    parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
+    return SlavePlant(*parts, texts, slave, environment)
 
 
 @dataclass(frozen=True)
@@ -218,11 +219,9 @@ class ParsedSlave:
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
-            raise DrakeTeleopError(
-                f"no body with a mass is attached to {frame.name()}",
-                where="slave.tool",
-                remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
-            )
+            what = f"no body with a mass is attached to {frame.name()}"
+            remedy = "set slave.tool, or a sensor_frame between the arm and the model's own tool"
+            raise DrakeTeleopError(what, where="slave.tool", remedy=remedy)
         check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
@@ -330,11 +329,8 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         tip = plant.GetFrameByName("tip", instance)
         if slave.tool is not None and tip.body().index() == parsed.tool:  # the body frame is S
             return tip.GetFixedPoseInBodyFrame().translation()
-        X_WS, X_WTip = (
-            frame.CalcPoseInWorld(plant.CreateDefaultContext())
-            for frame in (parsed.sensor_frame, tip)
-        )
-        return X_WS.InvertAndCompose(X_WTip).translation()
+        context = plant.CreateDefaultContext()
+        return tip.CalcPose(context, parsed.sensor_frame).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
     if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
         return _farthest_hull_point_along_z(hulls)

@@ -149,14 +149,10 @@ class ToolContact(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = self._state.Eval(context)
-        environment_wrench(
-            *self._contact,
-            state[: self._n],
-            state[self._n :],
-            self._nothing if self._sheet is None else self._sheet.Eval(context),
-            self._nothing if self._plant is None else self._plant.Eval(context),
-            output.get_mutable_value(),
-        )
+        q, v = state[: self._n], state[self._n :]
+        sheet = self._nothing if self._sheet is None else self._sheet.Eval(context)
+        plant = self._nothing if self._plant is None else self._plant.Eval(context)
+        environment_wrench(*self._contact, q, v, sheet, plant, output.get_mutable_value())
 
 
 @njit(cache=True)
@@ -177,12 +173,8 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
-    q, v, sheet, plant = (
-        x[: half - 1],
-        x[half : 2 * half - 1],
-        x[half - 1 : 2 * half : half],
-        x[2 * half :],
-    )
+    q, v = x[: half - 1], x[half : 2 * half - 1]
+    sheet, plant = x[half - 1 : 2 * half : half], x[2 * half :]
     if not _take_or_request_given_wrench(given, x, wrench_W):
         environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
     else:

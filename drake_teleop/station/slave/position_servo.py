@@ -32,9 +32,7 @@ class PositionInterface:
     """Settings of the position interface of an arm; m instead of rad for prismatic joints."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(
-        0.004, "s", 0.0, 1.0, "dead time of a command; whole periods of command_hz"
-    )
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time; whole periods of command_hz")
     acceleration_per_error: float = quantity(
         300.0, "1/s^2", 1.0, 1e7, "acceleration per position error"
     )
@@ -46,7 +44,7 @@ class PositionInterface:
         40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
     )
     drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets the joint stiffness"
+        30.0, "Hz", 0.1, 1e3, "of the drives; sets joint stiffness"
     )
 
     def check(self, where: str, rate: float) -> None:
@@ -163,32 +161,20 @@ class PositionServo(LeafSystem):
     __slots__ = ONE_DICT
 
     def __init__(
-        self,
-        arm: ArmModel,
-        interface: PositionInterface,
-        period: float,
-        q_start: Array,
+        self, arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
     ) -> None:
         super().__init__()
         n = arm.num_joints
         self._arm = arm.table
         queued = round(interface.dead_time * interface.command_hz)
-        numbers = [
-            period,
-            interface.acceleration_per_error,
-            interface.lookahead,
-            2 * np.pi * interface.drive_bandwidth_hz,
-            round(1 / (interface.command_hz * period)),
-            queued,
-        ]
+        drives = 2 * np.pi * interface.drive_bandwidth_hz
+        every = round(1 / (interface.command_hz * period))
+        gains = interface.acceleration_per_error, interface.lookahead
+        numbers = [period, *gains, drives, every, queued]
         speed = np.minimum(arm.velocity_limit, interface.max_speed)
         acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)
-        self._constants = (
-            np.array(numbers),
-            np.array([speed, acceleration]),
-            arm.effort_limit,
-            np.zeros((6, n)),
-        )
+        limits = np.array([speed, acceleration]), arm.effort_limit
+        self._constants = (np.array(numbers), *limits, np.zeros((6, n)))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
@@ -198,11 +184,6 @@ class PositionServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        position_servo_torque(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            *self._constants,
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(0),
-        )
+        inputs = self._command.Eval(context), self._state.Eval(context)
+        torque, memory = (discrete_state.get_mutable_value(group) for group in range(2))
+        position_servo_torque(self._arm, *inputs, *self._constants, memory, torque)

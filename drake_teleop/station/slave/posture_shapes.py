@@ -237,14 +237,11 @@ def start_overlaps(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
-    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _cached_start_overlaps(HashableByValue((slave, parts)), written)
+    return _cached_start_overlaps(HashableByValue((slave, parts), slave.model_files()))
 
 
 @lru_cache(maxsize=4)
-def _cached_start_overlaps(
-    key: HashableByValue, _: tuple[int, ...]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _cached_start_overlaps(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
@@ -323,10 +320,6 @@ def hull_points_of(inspector: SceneGraphInspector, geometry: GeometryId) -> Arra
 def _unit_sphere_points() -> Array:
     latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_CIRCLE_POINTS // 2 + 1)
     longitude = 2 * np.pi * np.arange(_NUM_CIRCLE_POINTS) / _NUM_CIRCLE_POINTS
-    rings = [
-        np.column_stack(
-            [c * np.cos(longitude), c * np.sin(longitude), np.full(_NUM_CIRCLE_POINTS, s)]
-        )
-        for c, s in zip(np.cos(latitude), np.sin(latitude), strict=True)
-    ]
-    return np.vstack(rings)
+    latitudes, longitudes = np.meshgrid(latitude, longitude, indexing="ij")
+    x, y = np.cos(latitudes) * np.cos(longitudes), np.cos(latitudes) * np.sin(longitudes)
+    return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)

@@ -13,7 +13,6 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
@@ -99,18 +98,13 @@ class SampledServo(LeafSystem):
     """Block that controls joints by computed torque, with several servo samples per event.
 
     Outputs are the torque (n,) now [N m] and its rate (n,) [N m/s]. `period` is the servo's period
-    [s], `samples` their number per event, `q_start` the posture held before the first sample.
+    [s], `samples` their number per event.
     """
 
     __slots__ = ONE_DICT
 
     def __init__(
-        self,
-        slave: SlavePlant,
-        config: JointControlConfig,
-        period: float,
-        samples: int,
-        q_start: Array,
+        self, slave: SlavePlant, config: JointControlConfig, period: float, samples: int
     ) -> None:
         super().__init__()
         arm = slave.arm
@@ -125,7 +119,7 @@ class SampledServo(LeafSystem):
         self._at_rest, self._sheet = np.zeros(2), None
         if slave.compiled_sheet_instance is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        holding = holding_torque(arm, q_start)
+        holding = holding_torque(arm, slave.start)
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
@@ -143,12 +137,7 @@ class SampledServo(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
-        predict_torque_line(
-            self._arm,
-            self._command.Eval(context),
-            self._state.Eval(context),
-            self._at_rest if self._sheet is None else self._sheet.Eval(context),
-            *self._constants,
-            following[:-1],
-        )
+        sheet = self._at_rest if self._sheet is None else self._sheet.Eval(context)
+        inputs = self._command.Eval(context), self._state.Eval(context), sheet
+        predict_torque_line(self._arm, *inputs, *self._constants, following[:-1])
         following[-1] = context.get_time()

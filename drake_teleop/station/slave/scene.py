@@ -1,6 +1,5 @@
 """Environment from a file: SDF, URDF or Drake model directives."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,24 +34,17 @@ class Scene(Environment):
     """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
-        "door.sdf",
-        ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
+        "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
     )
-    position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots of the file, in W"
-    )
+    position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots, in W")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
     )
     fixed: bool = plain(True, "weld free roots of the file there; false: they float")
     contact: str = choice(
-        "point",
-        ("point", "hydroelastic"),
-        "Drake's contact model; shapes that are not hydroelastic use point",
+        "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )
-    tool_modulus: float = quantity(
-        1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool's shapes (E)"
-    )
+    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
     slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
@@ -64,11 +56,6 @@ class Scene(Environment):
     def hydroelastic(self) -> bool:
         return self.contact == "hydroelastic"
 
-    def with_absolute_paths(self, folder: Path) -> "Scene":
-        """Return a copy with the absolute path of `file`, if it exists in `folder`."""
-        path = (folder / self.file).resolve()
-        return dataclasses.replace(self, file=str(path)) if path.is_file() else self
-
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
@@ -77,19 +64,15 @@ class Scene(Environment):
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_BODY_NAMES:
-                raise DrakeTeleopError(
-                    f"the body name {body.name()} is reserved for the station",
-                    where=str(path),
-                    remedy="give it another name in the file",
-                )
+                what = f"the body name {body.name()} is reserved for the station"
+                remedy = "give it another name in the file"
+                raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
             if not supports_pose_conversion(joint):
-                raise DrakeTeleopError(
-                    f"the joint {joint.name()} has the unsupported type {joint.type_name()}",
-                    where=str(path),
-                    remedy="use revolute, prismatic, fixed or free joints",
-                )
+                what = f"the joint {joint.name()} has the unsupported type {joint.type_name()}"
+                remedy = "use revolute, prismatic, fixed or free joints"
+                raise DrakeTeleopError(what, where=str(path), remedy=remedy)
         attached = {joint.child_body().index() for joint in joints}
         bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)

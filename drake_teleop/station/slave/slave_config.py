@@ -1,10 +1,9 @@
 """Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
 
-import dataclasses
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
@@ -42,11 +41,10 @@ class Slave:
         IK_METHODS,
     )
     model: str = plain(
-        "",
-        "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90",
+        "", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90", is_path=True
     )
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses in model and tool, from the scenario's folder"
+        [], "folders of package:// addresses, from the scenario's folder", is_path=True
     )
     base_pose: list[float] = quantity(
         [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
@@ -54,29 +52,24 @@ class Slave:
     sensor_frame: str = plain(
         "sensor", "frame or link of the model at which the sensor measures: S; z_S towards the tool"
     )
-    home: list[float] = plain(
-        [], "joint positions at the start [rad, m]; default: computed from position"
+    home: list[float] = quantity(
+        [], "rad, m", -1e4, 1e4, "joint positions at the start; default: computed from position"
     )
-    hold: dict[str, float] = plain(
-        {}, "joints that are fixed, with their positions [rad, m], such as {torso_lift: 0.2}"
+    hold: dict[str, float] = quantity(
+        {}, "rad, m", -1e4, 1e4, "positions of joints that are fixed, such as {torso_lift: 0.2}"
     )
-    torque_limits: dict[str, float] = plain(
-        {}, "torque limits by joint instead of the model's [N m, N]; .inf: no limit"
+    torque_limits: dict[str, float] = quantity(
+        {}, "N m, N", 1e-6, math.inf, "limits by joint instead of the model's; .inf: no limit"
     )
-    friction: list[float] = plain(
-        [],
-        "dry friction of the joints [N m, N], one for all or each, not compensated by joint"
-        " control; default: none",
+    friction: list[float] = quantity(
+        [], "N m, N", 0.0, 1e6, "dry friction, one for all joints or each; control ignores it"
     )
     tool: Tool | None = field(
         default_factory=Tool,
         metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
-
-    tip: list[float] = plain(
-        [],
-        "contact point p_STip [m]; default: the tool's frame `tip`, or the end of its shapes along"
-        " z_S",
+    tip: list[float] = quantity(
+        [], "m", -10.0, 10.0, "p_STip; default: the frame `tip` or the end of the shapes along z_S"
     )
 
     @property
@@ -96,51 +89,11 @@ class Slave:
         return [path for path in paths if path.is_file()]
 
     def check(self, where: str) -> None:
-        if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
-            raise DrakeTeleopError(
-                "contains a number that is negative or not finite",
-                where=f"{where}.friction",
-                remedy="give finite numbers of 0 or more",
-            )
-        for name, length in (("home", len(self.home)), ("tip", 3)):
-            values = getattr(self, name)
-            if values and (len(values) != length or not all(np.isfinite(values))):
-                raise DrakeTeleopError(
-                    "must be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
-                    where=f"{where}.{name}",
-                )
-        for joint, position in self.hold.items():
-            if not np.isfinite(position):
-                raise DrakeTeleopError(
-                    f"{position:g} is not a finite position",
-                    where=f"{where}.hold.{joint}",
-                    remedy="give an angle [rad] or a distance [m]",
-                )
-        for joint, limit in self.torque_limits.items():
-            if not limit > 0.0:
-                raise DrakeTeleopError(
-                    f"{limit:g} is not a valid limit (it must be above 0)",
-                    where=f"{where}.torque_limits.{joint}",
-                    remedy="give a torque [N m] or force [N] above 0, or .inf",
-                )
+        if len(self.tip) not in (0, 3):
+            what = f"has {len(self.tip)} numbers"
+            raise DrakeTeleopError(what, where=f"{where}.tip", remedy="give 3 numbers, or none")
         if self.tool is not None:
             self.tool.check(f"{where}.tool")
-
-    def with_absolute_paths(self, folder: Path) -> "Slave":
-        """Return a copy with absolute paths; relative ones are relative to `folder`."""
-
-        def resolved_path(name: str) -> str:
-            return str((folder / name).resolve()) if name else ""
-
-        tool = self.tool
-        if tool is not None and tool.model:
-            tool = dataclasses.replace(tool, model=resolved_path(tool.model))
-        return dataclasses.replace(
-            self,
-            model=resolved_path(self.model),
-            package_paths=[resolved_path(path) for path in self.package_paths],
-            tool=tool,
-        )
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:

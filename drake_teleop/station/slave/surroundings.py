@@ -64,25 +64,16 @@ class ToolContactModel(NamedTuple):
         moving_bodies: indices of other moving bodies, by name.
     """
 
-    compiled_pairs: Array
-    monitored_pairs: Array
-    joint_table: Array
-    plant_state_size: int
-    drake_contact_reason: str
-    tool_bodies: frozenset[int]
-    tool_shapes: frozenset[int]
-    leaf_parameters: Array
-    leaf_instance: ModelInstanceIndex | None
-    moving_bodies: dict[str, BodyIndex]
-
-
-def make_empty_contact_model() -> ToolContactModel:
-    leaf = np.array([1.0, 0.0, 0.0, 0.0])
-    pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
-    monitored_pairs = np.zeros((0, NUM_MONITORED_COLUMNS))
-    return ToolContactModel(
-        pairs, monitored_pairs, joints, 0, "", frozenset(), frozenset(), leaf, None, {}
-    )
+    compiled_pairs: Array = np.zeros((0, NUM_PAIR_COLUMNS))
+    monitored_pairs: Array = np.zeros((0, NUM_MONITORED_COLUMNS))
+    joint_table: Array = np.zeros((0, NUM_JOINT_COLUMNS))
+    plant_state_size: int = 0
+    drake_contact_reason: str = ""
+    tool_bodies: frozenset[int] = frozenset()
+    tool_shapes: frozenset[int] = frozenset()
+    leaf_parameters: Array = np.array([1.0, 0.0, 0.0, 0.0])
+    leaf_instance: ModelInstanceIndex | None = None
+    moving_bodies: dict[str, BodyIndex] = {}  # noqa: RUF012  (never changed)
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvironment:
@@ -110,7 +101,7 @@ def MakeToolContactModel(
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
-    contact = make_empty_contact_model()._replace(
+    contact = ToolContactModel(
         # Integers, because Drake's identifiers would keep the plant alive.
         tool_bodies=frozenset(int(index) for index in shapes),
         tool_shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
@@ -165,11 +156,8 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
     if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
         bodies = {name: plant.get_body(index) for name, index in contact.moving_bodies.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
-        raise DrakeTeleopError(
-            f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia",
-            where="environment",
-            remedy="give it both, or fix it",
-        )
+        what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
+        raise DrakeTeleopError(what, where="environment", remedy="give it both, or fix it")
 
 
 def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:

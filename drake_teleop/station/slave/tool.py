@@ -4,21 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    Box,
-    Cylinder,
-    ProximityProperties,
-    Shape,
-    Sphere,
-)
+from pydrake.geometry import Box, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia, WeldJoint
 
 from drake_teleop.common.config import plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
+from drake_teleop.station.environment.environment import ContactMaterial
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
@@ -73,15 +67,11 @@ class Block:
 class Tool:
     """Tool, by default the paper's; a model file or a mass replaces it."""
 
-    model: str = plain("", "file of a tool: its root link is put on S")
+    model: str = plain("", "file of a tool: its root link is put on S", is_path=True)
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
-        [0.0] * 6,
-        "kg m^2",
-        -10.0,
-        10.0,
-        "about the centre of mass: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel",
+        [0.0] * 6, "kg m^2", -10.0, 10.0, "about com: xx, xy, xz, yy, yz, zz; zeros: steel ball"
     )
     shapes: list[Ball | Block] = plain([], "collision shapes: !Ball, !Block")
 
@@ -91,23 +81,16 @@ class Tool:
 
     def check(self, where: str) -> None:
         if self.model and self.mass:
-            raise DrakeTeleopError(
-                "a model file and a mass both define the tool",
-                where=f"{where}.mass",
-                remedy="leave one of them out",
-            )
+            what = "a model file and a mass both define the tool"
+            raise DrakeTeleopError(what, where=f"{where}.mass", remedy="leave one of them out")
         if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            raise DrakeTeleopError(
-                "shapes and inertia require a mass",
-                where=f"{where}.mass",
-                remedy="give the mass, or remove them",
-            )
+            what = "shapes and inertia require a mass"
+            remedy = "give the mass, or remove them"
+            raise DrakeTeleopError(what, where=f"{where}.mass", remedy=remedy)
         if not _tool_spatial_inertia(self).IsPhysicallyValid():
-            raise DrakeTeleopError(
-                "the inertia is impossible for a rigid body",
-                where=f"{where}.inertia",
-                remedy="give entries of the tensor about the centre of mass, or leave it out",
-            )
+            what = "the inertia is impossible for a rigid body"
+            remedy = "give entries of the tensor about the centre of mass, or leave it out"
+            raise DrakeTeleopError(what, where=f"{where}.inertia", remedy=remedy)
 
 
 def end_of_tool_shapes(tool: Tool) -> list[float] | None:
@@ -135,9 +118,9 @@ def AddTool(
 
 
 def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
-    surface = ProximityProperties()
-    friction = CoulombFriction(_TOOL_FRICTION_COEFFICIENT, _TOOL_FRICTION_COEFFICIENT)
-    AddContactMaterial(surface, _CONTACT_DISSIPATION_S_M, _CONTACT_STIFFNESS_N_M, friction)
+    surface = ContactMaterial(
+        _CONTACT_STIFFNESS_N_M, _CONTACT_DISSIPATION_S_M, _TOOL_FRICTION_COEFFICIENT
+    )
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -11,14 +12,10 @@ from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, p
 from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_PLACE_OF_INERTIA_ENTRY = {
-    "ixx": (0, 0),
-    "ixy": (0, 1),
-    "ixz": (0, 2),
-    "iyy": (1, 1),
-    "iyz": (1, 2),
-    "izz": (2, 2),
-}
+_INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_PLACE_OF_INERTIA_ENTRY = dict(
+    zip(_INERTIA_ENTRIES, combinations_with_replacement(range(3), 2), strict=True)
+)
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
@@ -95,12 +92,7 @@ def correct_impossible_inertia(inertia: Array, name: str, report: RepairReport) 
 
 
 def _add_inertial_element(
-    link: Element,
-    pose: Element | None,
-    mass: float,
-    inertia: Array,
-    *,
-    is_sdf: bool,
+    link: Element, pose: Element | None, mass: float, inertia: Array, *, is_sdf: bool
 ) -> None:
     inertial = SubElement(link, "inertial")
     if pose is not None:
@@ -116,9 +108,7 @@ def _add_inertial_element(
         SubElement(inertial, "inertia", entries)
 
 
-def nearest_possible_inertia(
-    inertia: Array,
-) -> tuple[Array, float]:
+def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal

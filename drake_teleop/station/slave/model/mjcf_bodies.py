@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from xml.etree.ElementTree import Element
 
@@ -32,13 +32,8 @@ from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
 _BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
 _DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
-_NUM_SIZE_VALUES_OF_SHAPE = {
-    "sphere": 1,
-    "capsule": 2,
-    "cylinder": 2,
-    "ellipsoid": 3,
-    "box": 3,
-}  # numbers in size
+# Numbers in size.
+_NUM_SIZE_VALUES_OF_SHAPE = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _ROUND_ROD_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
 
@@ -57,9 +52,7 @@ class Joint:
 
     def transformed_by(self, X: RigidTransform) -> Joint:
         """Return a copy whose anchor and axis are transformed by X."""
-        anchor, axis = X @ self.anchor, X.rotation() @ self.axis
-        limits, ref = self.limits, self.ref
-        return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
+        return replace(self, anchor=X @ self.anchor, axis=X.rotation() @ self.axis)
 
 
 @dataclass(eq=False)
@@ -214,11 +207,7 @@ class BodyReader:
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
-        elif (
-            kind in _NUM_SIZE_VALUES_OF_SHAPE
-            and not name
-            and min(size[: _NUM_SIZE_VALUES_OF_SHAPE[kind]]) <= 0.0
-        ):
+        elif not name and min(size[: _NUM_SIZE_VALUES_OF_SHAPE.get(kind, 0)], default=1.0) <= 0.0:
             fault = "shapes need a size above 0"
         if fault:
             self.lost.setdefault(fault, []).append((body, given))
@@ -266,11 +255,9 @@ class BodyReader:
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return ZERO_MASS_PROPERTIES
         try:
-            shape = (
-                mass_properties_of_mesh(geom.mesh)
-                if geom.mesh
-                else mass_properties_of_primitive(geom.kind, geom.size)
-            )
+            shape = mass_properties_of_primitive(geom.kind, geom.size)
+            if geom.mesh:
+                shape = mass_properties_of_mesh(geom.mesh)
         except ValueError as error:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return ZERO_MASS_PROPERTIES

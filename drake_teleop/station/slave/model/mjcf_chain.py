@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from difflib import get_close_matches
 from xml.etree.ElementTree import Element
 
 from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.repair_report import describe_frame_fault
 
-_MAX_SUGGESTED_FRAMES = 12  # names of frames in an error: the most similar ones
 _LOOP_EQUALITY_TAGS = ("connect", "weld", "distance")
-_UNBOUNDED_ACTUATOR_DYNAMICS = (
-    "integrator",
-    "muscle",
-    "user",
-    "dcmotor",
-)  # dynamics whose output has no range
+# Dynamics whose output has no range.
+_UNBOUNDED_ACTUATOR_DYNAMICS = ("integrator", "muscle", "user", "dcmotor")
 
 
 def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
@@ -28,15 +23,9 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
     if len(carriers) != 1:
-        known = {
-            name
-            for tag in ("body", "site")
-            for top, *_ in tops
-            for name in _names_of_elements(top, tag)
-        }
-        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_SUGGESTED_FRAMES, cutoff=0.0)
-        remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
-        what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
+        names = [_names_of_elements(top, tag) for tag in ("body", "site") for top, *_ in tops]
+        known = set[str]().union(*names) - {""}
+        what = "; ".join(describe_frame_fault(len(carriers), sensor, known))
         for fault in (what, *reader.meshes.inaccessible):
             mjcf.report.add_fault(fault)
         mjcf.report.raise_faults(mjcf.path)
@@ -126,9 +115,8 @@ def report_lost_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
             mjcf.report.state_repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            mjcf.report.state_repair(
-                "no spring, which Drake does not read from MJCF, of", joint.name
-            )
+            what = "no spring, which Drake does not read from MJCF, of"
+            mjcf.report.state_repair(what, joint.name)
 
 
 def _names_of_elements(top: Element, tag: str) -> set[str]:
@@ -234,11 +222,8 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    if (
-        biased
-        or given.get("gaintype", "fixed") != "fixed"
-        or given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
-    ):
+    is_unbounded = given.get("dyntype") in _UNBOUNDED_ACTUATOR_DYNAMICS
+    if biased or given.get("gaintype", "fixed") != "fixed" or is_unbounded:
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
 

@@ -70,7 +70,7 @@ def mass_properties_of_mesh(mesh: Mesh) -> MassProperties:
 
     The rule "legacy" counts all tetrahedra between triangles and centre as positive.
     """
-    triangles = mesh.triangles()
+    triangles = mesh.triangles
     if mesh.inertia == "convex":
         triangles = convex_hull(triangles.vertices)
     corners = triangles.vertices[triangles.faces]
@@ -99,7 +99,7 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
     moments, axes = moments[::-1], axes[:, ::-1]  # the longest axis becomes z
     axes[:, 2] *= np.linalg.det(axes)
     if by_box:
-        inside = (mesh.triangles().vertices - centre) @ axes
+        inside = (mesh.triangles.vertices - centre) @ axes
         half = (inside.max(axis=0) - inside.min(axis=0)) / 2
         centre = centre + axes @ (inside.max(axis=0) + inside.min(axis=0)) / 2
         radius, width = float(half.max()), float(half[:2].max())

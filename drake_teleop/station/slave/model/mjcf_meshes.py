@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cached_property
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -32,7 +33,6 @@ class Mesh:
         reference = {"pos": attributes.get("refpos", "0 0 0")}
         reference["quat"] = attributes.get("refquat", "1 0 0 0")
         self._X_FM = mjcf.read_pose(Attributes(reference, attributes.label, mjcf.report))
-        self._triangles: Triangles | None = None
 
     @property
     def is_readable_by_drake(self) -> bool:
@@ -40,28 +40,27 @@ class Mesh:
         unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
+    @cached_property
     def triangles(self) -> Triangles:
-        """Return the triangles with scale and reference pose applied."""
-        if self._triangles is None:
-            if self.file is not None:
-                vertices, faces = read_triangles(self.file)
-            else:
-                vertices, faces = check_triangle_vertices(_read_inline_mesh(self._attributes))
-            moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
-            if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
-                faces = faces[:, ::-1]
-            self._triangles = Triangles(moved, faces)
-        return self._triangles
+        """The triangles with scale and reference pose applied."""
+        if self.file is not None:
+            vertices, faces = read_triangles(self.file)
+        else:
+            vertices, faces = check_triangle_vertices(_read_inline_mesh(self._attributes))
+        moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
+        if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
+            faces = faces[:, ::-1]
+        return Triangles(moved, faces)
 
     def write_obj(self, folder: Path) -> Path:
         """Return an .obj file for Drake, written to `folder` if conversion is necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
-        return self._write_triangles(self.triangles(), folder)
+        return self._write_triangles(self.triangles, folder)
 
     def write_hull(self, folder: Path) -> Path:
         """Write the convex hull, for contact, to an .obj file in `folder`; return its path."""
-        return self._write_triangles(convex_hull(self.triangles().vertices), folder)
+        return self._write_triangles(convex_hull(self.triangles.vertices), folder)
 
     def _write_triangles(self, triangles: Triangles, folder: Path) -> Path:
         number = len(list(folder.iterdir()))
@@ -90,7 +89,7 @@ class MeshLibrary:
         mesh = self._meshes.get(name, _MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:
-                mesh.triangles()
+                _ = mesh.triangles
             except ValueError:
                 suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
                 self._meshes[name] = mesh = f"{suffix}{_MESHES_UNREADABLE_FAULT}"

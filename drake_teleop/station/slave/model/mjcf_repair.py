@@ -12,19 +12,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from drake_teleop.station.slave.model import mjcf_chain
 from drake_teleop.station.slave.model.link_repair import (
     correct_impossible_inertia,
     nearest_possible_inertia,
 )
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, takes_part_in_contacts
-from drake_teleop.station.slave.model.mjcf_chain import (
-    check_joint_couplings,
-    effort_limits,
-    read_whole_world,
-    read_world_with_arm,
-    report_lost_couplings,
-    weld_joints_outside_chain,
-)
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_masses import ZERO_MASS_PROPERTIES
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
@@ -53,17 +46,17 @@ def repair_mjcf(
             report.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
-        world = read_whole_world(reader)
+        world = mjcf_chain.read_whole_world(reader)
         chain = world.with_descendants() if is_complete else []
     else:
-        world = read_world_with_arm(mjcf, reader, purpose.sensor_name)
+        world = mjcf_chain.read_world_with_arm(mjcf, reader, purpose.sensor_name)
         chain = world.bodies_on_path_to(purpose.sensor_name)
     if is_complete:
         moving = [(body, joint) for body in chain for joint in body.joints]
-        report_lost_couplings([joint for _, joint in moving], mjcf)
+        mjcf_chain.report_lost_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = weld_joints_outside_chain(world, chain, purpose.held_positions, mjcf)
-        check_joint_couplings(world, chain, [joint for _, joint in moving], mjcf)
+        moving = mjcf_chain.weld_joints_outside_chain(world, chain, purpose.held_positions, mjcf)
+        mjcf_chain.check_joint_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
         report.state_assumption(
@@ -72,7 +65,7 @@ def repair_mjcf(
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
     _check_names_and_generators(world, report)
     _set_body_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
-    limits = effort_limits(mjcf, joints)
+    limits = mjcf_chain.effort_limits(mjcf, joints)
     _report_lost_shapes(reader, report)
     report.raise_faults(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
@@ -123,11 +116,9 @@ def _set_mass_of_body(
         body.inertial = ZERO_MASS_PROPERTIES
         return
     properties = properties.with_mass(factor * properties.mass)
-    inertia = (
-        correct_impossible_inertia(properties.inertia, body.name, report)
-        if is_moved
-        else nearest_possible_inertia(properties.inertia)[0]
-    )
+    inertia = nearest_possible_inertia(properties.inertia)[0]
+    if is_moved:
+        inertia = correct_impossible_inertia(properties.inertia, body.name, report)
     body.inertial = properties._replace(inertia=inertia)
 
 

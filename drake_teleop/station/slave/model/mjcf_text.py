@@ -94,11 +94,8 @@ class MjcfText:
         if geom.mesh is None or self._purpose.is_scene or not geom.takes_part_in_contacts:
             values |= {} if geom.takes_part_in_contacts else seen
             values |= {} if geom.is_visible else felt
-            shape = (
-                {"size": _format_numbers(geom.size)}
-                if geom.mesh is None
-                else self._add_mesh_asset(geom.mesh)
-            )
+            size = {"size": _format_numbers(geom.size)}
+            shape = size if geom.mesh is None else self._add_mesh_asset(geom.mesh)
             SubElement(element, "geom", {**values, **shape})
             return
         if geom.is_visible:

@@ -27,17 +27,8 @@ from drake_teleop.common.texts import read_yaml
 _MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50_000_000
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
-_BINARY_SUFFIXES = (
-    ".obj",
-    ".glb",
-    ".bin",
-    ".stl",
-    ".vtk",
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".ktx2",
-    ".dae",
+_BINARY_SUFFIXES = set(
+    [".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae"]
 )
 _PACKAGE_FILE_NAME = "package.xml"
 _FILE_ATTRIBUTE_NAME_PATTERN = re.compile(
@@ -135,11 +126,9 @@ class ModelFiles:
     def _count_with_references(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read_file(real):
-            raise DrakeTeleopError(
-                f"references {real}, which is outside the model's folder and its packages",
-                where=where,
-                remedy="move it there, or name its folder: --package-path, slave.package_paths",
-            )
+            what = f"references {real}, which is outside the model's folder and its packages"
+            remedy = "move it there, or name its folder: --package-path, slave.package_paths"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)
         if real in including or len(including) > _MAX_INCLUDE_DEPTH:
             what = "includes itself" if real in including else "is nested too deeply"
             raise DrakeTeleopError(
@@ -147,11 +136,8 @@ class ModelFiles:
             )
         if real not in self._sizes:
             if not (real.is_file() or real.is_dir()):
-                raise DrakeTeleopError(
-                    f"references {path}, which does not exist",
-                    where=where,
-                    remedy="correct the path or add the file",
-                )
+                what = f"references {path}, which does not exist"
+                raise DrakeTeleopError(what, where=where, remedy="correct the path or add the file")
             files, size = 1, real.stat().st_size
             _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
@@ -287,7 +273,6 @@ def _addresses_in_gltf(path: Path) -> list[str]:
     try:
         json.loads(data, object_pairs_hook=collect_uris)
     except (ValueError, RecursionError) as error:
-        raise DrakeTeleopError(
-            f"is not a glTF file ({error})", where=str(path), remedy="export it again"
-        ) from None
+        what = f"is not a glTF file ({error})"
+        raise DrakeTeleopError(what, where=str(path), remedy="export it again") from None
     return found

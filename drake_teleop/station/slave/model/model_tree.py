@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 from drake_teleop.station.slave.model.repair_report import RepairReport
@@ -25,19 +24,6 @@ def joint_end(joint: Element, name: str) -> str:
     return "" if element is None else (element.get("link") or element.text or "").strip()
 
 
-@dataclass(eq=False)
-class ModelTree:
-    """Result of `reduce_to_chain`.
-
-    Attributes:
-        chain: joints from the root to the sensor's link, also fixed ones.
-        num_joints_to_link: number of moving joints of the chain between the root and each link.
-    """
-
-    chain: list[Element]
-    num_joints_to_link: dict[str, int]
-
-
 def link_of_frame(scope: Element, frame: str) -> str:
     """Return the link that carries the frame, link or joint `frame`, or an empty text."""
     links = [link.get("name", "") for link in scope.findall("link")]
@@ -55,11 +41,12 @@ def link_of_frame(scope: Element, frame: str) -> str:
 
 def reduce_to_chain(
     scope: Element, sensor_link: str, hold: set[str], report: RepairReport
-) -> ModelTree | None:
+) -> tuple[list[Element], dict[str, int]] | None:
     """Keep the tree of links with the sensor; fix joints that are not between root and sensor.
 
     Other trees and joints that close a loop are removed. The joints `hold` count as fixed. Return
-    None, with a fault in `report`, if the joints up to the sensor are ambiguous.
+    the joints from the root to the sensor's link, also fixed ones, and the number of moving ones
+    between the root and each link; or None, with a fault in `report`, if they are ambiguous.
     """
     chain = _joint_chain_to_link(scope, sensor_link, report)
     if chain is None:
@@ -72,7 +59,7 @@ def reduce_to_chain(
         if id(joint) not in in_chain and joint.get("name") not in hold:
             make_joint_fixed(joint, report)
     _remove_loops(scope, num_joints_to_link, report)
-    return ModelTree(chain, num_joints_to_link)
+    return chain, num_joints_to_link
 
 
 def make_joint_fixed(joint: Element, report: RepairReport) -> None:

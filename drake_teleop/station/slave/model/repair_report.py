@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,17 @@ class RepairedModel(NamedTuple):
     effort_limits: dict[str, float]
     dependence_reasons: dict[str, str] = {}  # noqa: RUF012  (never changed)
     auxiliary_bodies: frozenset[str] = frozenset()
+
+
+def merge_repaired_models(text: str, models: list[RepairedModel]) -> RepairedModel:
+    """Return one model with this text and what the repairs of all `models` report."""
+    return RepairedModel(
+        text,
+        list(dict.fromkeys(line for each in models for line in each.assumptions)),
+        {n: x for each in models for n, x in each.effort_limits.items()},
+        {name: why for each in models for name, why in each.dependence_reasons.items()},
+        frozenset(name for each in models for name in each.auxiliary_bodies),
+    )
 
 
 class RepairReport:
@@ -76,6 +88,13 @@ class RepairReport:
         if causes:
             what = f"the model has {len(causes)} faults: {'; '.join(texts)}"
             raise DrakeTeleopError(what, where=str(file))
+
+
+def describe_frame_fault(count: int, name: str, known: set[str]) -> tuple[str, str]:
+    """Return fault and remedy for a sensor frame `name` that `count` frames have, if not one."""
+    near = get_close_matches(name, sorted(known), n=_MAX_JOINED_NAMES, cutoff=0.0)
+    remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"
+    return f"{count or 'no'} frames are named {name!r}", remedy
 
 
 def join_names(names: Iterable[str]) -> str:

@@ -8,7 +8,11 @@ from xml.etree.ElementTree import Element, SubElement
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.model_tree import link_of_frame
-from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
+from drake_teleop.station.slave.model.repair_report import (
+    RepairedModel,
+    RepairReport,
+    merge_repaired_models,
+)
 from drake_teleop.station.slave.model.urdf_repair import (
     ModelPurpose,
     convert_meshes_and_write_text,
@@ -50,14 +54,7 @@ def repair_sdf(
     own = convert_meshes_and_write_text(
         root, file, files, report, folder if purpose.plant_has_shapes else None
     )
-    for each in (each for each in inner if each is not None):
-        own = RepairedModel(
-            own.text,
-            own.assumptions + each.assumptions,
-            own.effort_limits | each.effort_limits,
-            own.dependence_reasons | each.dependence_reasons,
-        )
-    return own
+    return merge_repaired_models(own.text, [own, *filter(None, inner)])
 
 
 def _repair_included_file(

@@ -22,7 +22,6 @@ from drake_teleop.station.slave.model.model_numbers import (
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_tree import (
     WORLD_NAME,
-    ModelTree,
     joint_end,
     link_of_frame,
     list_joints,
@@ -84,15 +83,15 @@ def repair_links_and_joints(
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _make_names_unique(scope, report)
-    tree = _reduce_model_to_arm(scopes, purpose, report)
-    chain = set() if tree is None else set(map(id, tree.chain))
+    chain, num_joints_to_link = _reduce_model_to_arm(scopes, purpose, report) or ([], {})
+    in_chain_ids = set(map(id, chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
         for joint in list_joints(scope):
             if joint.get("name") in purpose.held_positions:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
-            in_chain = id(joint) in chain and joint.get("name") not in purpose.held_positions
+            in_chain = id(joint) in in_chain_ids and joint.get("name") not in purpose.held_positions
             repair_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
@@ -101,7 +100,7 @@ def repair_links_and_joints(
             name = link.get("name", "")
             for part in [link] if purpose.is_scene else link.findall("inertial"):
                 check_lengths_and_inertias(part, f"link {name}", report)
-            at_rest = tree is not None and tree.num_joints_to_link.get(name) == 0
+            at_rest = num_joints_to_link.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
@@ -143,7 +142,7 @@ def find_dependence_reasons(root: Element) -> dict[str, str]:
 
 def _reduce_model_to_arm(
     scopes: list[Element], purpose: ModelPurpose, report: RepairReport
-) -> ModelTree | None:
+) -> tuple[list[Element], dict[str, int]] | None:
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in list_joints(scope)):
             make_joint_fixed(joint, report)
@@ -195,9 +194,8 @@ def _has_valid_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
-    values = (
-        [] if colour is None else [parse_number(word) for word in colour.get("rgba", "").split()]
-    )
+    words = [] if colour is None else colour.get("rgba", "").split()
+    values = [parse_number(word) for word in words]
     return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
 
 

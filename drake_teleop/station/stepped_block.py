@@ -23,6 +23,7 @@ class SteppedBlock(DoubleOnly, LeafSystem):
 
         `results` are start values of the step's results; the first `num_states` are the states.
         """
+        # Integers are faster than Drake's own indices.
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
         producer = ValueProducer(
             allocate=lambda: AbstractValue.Make([np.array(part) for part in results]),
@@ -30,7 +31,7 @@ class SteppedBlock(DoubleOnly, LeafSystem):
         )
         sources = {self.all_input_ports_ticket(), self.xd_ticket()}
         step = self.DeclareCacheEntry("step", producer, sources)
-        self._step = step.cache_index()
+        self._step = step.cache_index()  # the entry itself would keep the block alive
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         return step.ticket()
 
