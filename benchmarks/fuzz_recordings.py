@@ -31,10 +31,10 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import models_dir
+from drake_teleop.common.files import INPUTS_FILE, models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
-from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
+from drake_teleop.live.inputs import Inputs, read_inputs
 from drake_teleop.live.record import SessionRecord, versions_and_file_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import Recorder

@@ -43,7 +43,7 @@ from drake_teleop.lab.comparison.station_accounts import load_work, start_energy
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
-from drake_teleop.station.environment.solids import Box, Wall
+from drake_teleop.station.environment.solids import Box, Surface, Wall
 from drake_teleop.station.master.data_sheets import FIGURES, Master
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
@@ -338,8 +338,9 @@ def missed(row: dict[str, Any]) -> list[str]:
     return [name for name, well in zip(CRITERIA, kept, strict=True) if not well]
 
 
-def run_cell(seed: int, index: int, method: str, known: str | None = None) -> dict[str, Any]:
+def run_cell(seed: int, index: int, method: str, known: str | None, slip: float) -> dict[str, Any]:
     """Run one cell; return its conditions, figures and failed criteria."""
+    Surface.slip = slip  # type: ignore[method-assign, assignment]
     drawn = KNOWN[known] if known else draw(seed, index)
     scenario, times = scenario_of(drawn, seed + index)
     scenario = replace(scenario, passivity=PassivityConfig(method=method))
@@ -404,6 +405,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", type=int, nargs="+", help="run only the cells with these numbers")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--method", nargs="+", choices=METHODS, default=["ledger"])
+    parser.add_argument("--slip", type=float, default=1e-3, help="slip speed of friction [m/s]")
     parser.add_argument("--known", action="store_true", help="run the known faults instead")
     parser.add_argument("--json", type=Path, help="file of the cells; finished ones are kept")
     asked = parser.parse_args(arguments)
@@ -413,7 +415,7 @@ def main(arguments: list[str] | None = None) -> int:
     cells: list[Any] = list(KNOWN) if asked.known else asked.only or list(range(asked.cells))
     done = {(row["method"], row["cell"]) for row in rows}
     cases = [
-        (asked.seed, 0 if asked.known else cell, method, cell if asked.known else None)
+        (asked.seed, 0 if asked.known else cell, method, cell if asked.known else None, asked.slip)
         for cell in cells
         for method in asked.method
         if (method, cell) not in done

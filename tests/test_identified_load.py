@@ -16,6 +16,8 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.tool import Tool
 
 # Load close to the tool's, with numbers that have no short decimal form.
 RNG = np.random.default_rng(1)
@@ -123,6 +125,22 @@ def test_edited_sources_or_models_change_the_cache_key(identifications, tmp_path
         monkeypatch.setattr(module, "_SOURCES_HASH", each)
         identified_load(Scenario())
     assert len(identifications) == 4
+
+
+def test_edited_included_model_changes_the_cache_key(identifications, tmp_path):
+    tool = tmp_path / "tool.sdf"
+    tool.write_text(
+        '<sdf version="1.9"><model name="a"><include><uri>gripper.sdf</uri></include></model></sdf>'
+    )
+    scenario = replace(Scenario(), slave__tool=Tool(model=str(tool)))
+    for mass in (1.0, 2.0):
+        (tmp_path / "gripper.sdf").write_text(
+            '<sdf version="1.9"><model name="gripper"><link name="body">'
+            f"<inertial><mass>{mass}</mass></inertial></link></model></sdf>"
+        )
+        assert not identified_load(scenario).from_cache
+        assert identified_load(scenario).from_cache
+        assert np.isclose(NominalSlave(scenario.slave).arm.phi_load[0], mass)
 
 
 def damaged(content: bytes) -> dict[str, bytes]:

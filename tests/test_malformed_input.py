@@ -41,6 +41,21 @@ SCENARIOS = {
     ),
     "two leaves": ("{sheet_spring: {}, environment: [!SheetSpring {}]}", "yaml:environment"),
     "a slot too deep": ("slot: {depth: 0.5}", "slot.depth"),
+    "bandwidth beyond joint control": (
+        "joint_control: {velocity_bandwidth_hz: 700}",
+        "joint_control.velocity_bandwidth_hz",
+    ),
+    "negative seed of the sensor": ("wrist_sensor: {unit: -1}", "wrist_sensor.unit"),
+    "contact point in millimetres": ("slave: {tip: [0, 0, 112]}", "slave.tip"),
+    "centre of mass without a mass": ("slave: {tool: {com: [0, 0, 0.1]}}", "slave.tool.mass"),
+    "gripper of negative mass": (
+        "force_scaling: {gripper_phi: [-1, 0, 0, 0, 0, 0, 0, 0, 0, 0]}",
+        "force_scaling.gripper_phi",
+    ),
+    "scale too small for a method": (
+        "{kinematic_scaling: {rotation_scale: 1.0e-5}, passivity: {method: wave}}",
+        "passivity.method",
+    ),
     "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
 }
 
@@ -101,6 +116,24 @@ def test_a_malformed_scenario(name, tmp_path, capsys):
     assert expected in line
     if name not in ("out of reach", "master out of reach"):
         assert "scenario.yaml" in line
+
+
+def test_run_keeps_its_scenario_and_a_recorded_drive(tmp_path, capsys):
+    own, drive = tmp_path / "scenario.yaml", tmp_path / "drive"
+    drive.mkdir()
+    for path in (own, drive / "scenario.yaml", drive / "inputs.csv"):
+        path.write_text("{}  # mine")
+    line = error_line(["run", own, "--out", tmp_path], capsys)
+    assert "contains the input scenario.yaml, which the results would replace; give an" in line
+    line = error_line(["run", own, "--out", drive], capsys)
+    assert "drive: contains a recorded drive, which the results would replace" in line
+    assert {path.read_text() for path in tmp_path.rglob("*.*")} == {"{}  # mine"}
+
+
+def test_empty_output_folder_is_not_the_working_directory(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "'--out': the path is empty" in error_line(["run", "press", "--out", ""], capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_unknown_scenario_lists_the_known_ones(tmp_path, capsys):

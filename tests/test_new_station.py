@@ -11,6 +11,12 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
+from pydrake.multibody.parsing import (
+    LoadModelDirectivesFromString,
+    Parser,
+    ProcessModelDirectives,
+)
+from pydrake.multibody.plant import MultibodyPlant
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -118,7 +124,7 @@ def test_joint_margin_counts_more_than_cube_size():
 def turned(rpy, tmp_path):
     """Write the RX90 with a rotated frame on its sensor."""
     text = ARM.read_text()
-    frame = f'<frame name="turned" attached_to="sensor"><pose>0 0 0 {rpy}</pose></frame>'
+    frame = f'<frame name="ft" attached_to="sensor"><pose>0 0 0 {rpy}</pose></frame>'
     path = tmp_path / "turned.sdf"
     path.write_text(text.replace("</model>", f"{frame}</model>", 1))
     return path
@@ -131,10 +137,10 @@ def turned(rpy, tmp_path):
 )
 def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsys):
     path = turned(rpy, tmp_path)
-    new_command(tmp_path / "mine", path, "turned")
+    new_command(tmp_path / "mine", path, "ft")
     said = " ".join(capsys.readouterr().out.split())
     assert f"note: the tool points along {axis}_S" in said
-    assert f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>' in said
+    assert f'<frame name="ft_z_to_tool" attached_to="ft"><pose>0 0 0 {back}</pose></frame>' in said
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     start = NominalSlave(slave)
     R_WS = RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()
@@ -143,10 +149,25 @@ def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsy
     np.testing.assert_allclose(slave.tip, 0.112 * along, atol=1e-9)
     # The recommended frame gives a station with z_S down.
     text = path.read_text()
-    frame = f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>'
+    frame = f'<frame name="ft_z_to_tool" attached_to="ft"><pose>0 0 0 {back}</pose></frame>'
     path.write_text(text.replace("</model>", f"{frame}</model>", 1))
-    plan = plan_station(path, "ft")
+    plan = plan_station(path, "ft_z_to_tool")
     assert (plan.tool_axis_advice, plan.tip_S, plan.place.is_set_by_position) == ("", [], True)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_advised_line_of_directives_turns_z_to_the_tool(axis):
+    line = place.tool_frame_advice(None, Path("a.dmd.yaml"), "sensor", axis).split(" - ")[1]
+    line = line.split(" and give")[0].replace("MODEL", "arm")
+    plant = MultibodyPlant(0.0)
+    added = f"- add_model: {{name: arm, file: file://{ARM}}}"
+    text = f"directives:\n{added}\n- {line}\n"
+    ProcessModelDirectives(LoadModelDirectivesFromString(text), Parser(plant))
+    plant.Finalize()
+    frames = plant.GetFrameByName("sensor_z_to_tool"), plant.GetFrameByName("sensor")
+    X = plant.CalcRelativeTransform(plant.CreateDefaultContext(), *frames[::-1])
+    z_in_sensor = X.rotation().matrix()[:, 2]
+    np.testing.assert_allclose(z_in_sensor, np.eye(3)["xyz".index(axis)], atol=1e-4)
 
 
 def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ import pytest
 from shown import type_in
 
 from drake_teleop.cli.main import main
+from drake_teleop.common.config import fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import REGISTRIES, Registry, register_from_script
 from drake_teleop.lab.identification import true_load
@@ -25,7 +27,14 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
 from drake_teleop.robots.export import export_load
 from drake_teleop.robots.lines import JsonLineSource
-from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.environment.solids import Box, Wall
+from drake_teleop.station.master.data_sheets import FIGURES
+from drake_teleop.station.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    PassivityMethod,
+    step_addresses,
+)
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import ENVIRONMENTS, LoadScenario, Scenario, ScenarioFromData
 from drake_teleop.station.simulation import simulate
@@ -237,3 +246,33 @@ def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
     assert scenario.master.device(0.0, 0.0).mass_matrix(np.zeros(6))[0, 0] == pytest.approx(0.12)
     assert result["true_contact_wrench_W"].shape == (21, 6)
     assert np.abs(result["measured_wrench_S"][:, :3]).max() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("table", "part", "said"),
+    [
+        (FIGURES, {"friction": 0.2}, "device: 'own' is {'friction': 0.2}; register DeviceFigures"),
+        (ENVIRONMENTS, dict, "environment: 'own' is <class 'dict'>; register a class derived from"),
+        (ENVIRONMENTS, Wall(), "register a class derived from Environment"),
+    ],
+)
+def test_part_of_another_type_is_not_registered(table, part, said):
+    with pytest.raises(DrakeTeleopError, match=re.escape(said)):
+        table.register("own", part)
+    assert "own" not in table
+
+
+def test_step_that_is_not_compiled_is_an_error(monkeypatch):
+    def own_step(*arguments):
+        """Do nothing."""
+
+    monkeypatch.setitem(METHODS, "own", PassivityMethod(own_step, own_step))
+    with pytest.raises(
+        DrakeTeleopError, match=r"own_step: is not compiled; decorate it with @njit"
+    ):
+        step_addresses("own")
+
+
+def test_environment_with_plain_fields_is_described():
+    cup = dataclasses.make_dataclass("Cup", [("depth", float, 0.1)], bases=(Box,))
+    assert fields_of(cup)[-1].name == "depth"

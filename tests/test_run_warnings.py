@@ -7,10 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
 from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import (
     HOME_POSTURE_RAD,
     PEAK_FORCE_N,
@@ -152,6 +155,23 @@ def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
         for warning in found:
             assert warning.startswith("tool and wall overlap by 20.0 mm at the start")
             assert warning.endswith("environment, or give another start in slave.home")
+
+
+@pytest.mark.parametrize(("limit", "count"), [(0.9, 1), (9.0, 0)])
+def test_motors_of_a_leader_that_limit_the_force_are_reported(limit, count):
+    home = np.array([0.2, -0.6, 1.9, 0.3, 0.5, -0.2])
+    leader = Leader(str(models_dir() / "leader_arm.urdf"), hand_frame="hand", home=home.tolist())
+    leader.torque_limit = [limit]
+    device = leader.device(Scenario().master.position, 0.0, 0.0)
+    share = 0.9 / np.abs(device.jacobian(home).T @ [0, 0, 1, 0, 0, 0]).max()
+    changed = {
+        "master_state": (slice(0, 6), home - HOME_POSTURE_RAD),
+        "force_to_master": (2, share * during(1, 2)),
+    }
+    scenario = replace(OVER_NETWORK, master=Master(model="leader", leader=leader))
+    found = run_warnings(recorded(**changed), scenario, ARM)
+    assert len(found) == count
+    assert all("its largest force or torque" in each for each in found)
 
 
 def test_ledger_reserve_warning_gives_the_required_energy():

@@ -18,7 +18,13 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.operator.operator import MinimumJerk, Sine
 from drake_teleop.station.operator.task import Press
-from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.station.scenario import (
+    LoadScenario,
+    Scenario,
+    ScenarioFromData,
+    ScenarioNames,
+    replace,
+)
 from drake_teleop.station.scenario_reference import (
     json_schema,
     reference_page,
@@ -156,3 +162,13 @@ def test_scenario_that_reads_back_differently_is_not_written(
     with pytest.raises(DrakeTeleopError, match="YAML cannot represent the scenario's block slave;"):
         write_scenario(tmp_path / "cut.yaml", scenario)
     assert not (tmp_path / "cut.yaml").exists()
+
+
+def test_written_paths_are_those_of_the_working_directory(tmp_path, monkeypatch) -> None:
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path)
+    scenario = replace(Scenario(), slave__model="arm.urdf", channel__trace="ping.csv")
+    write_scenario(Path("out/scenario.yaml"), scenario)
+    found = LoadScenario(Path("out/scenario.yaml"))
+    read = [found.slave.model, found.channel.trace]
+    assert read == [str(tmp_path / name) for name in ("arm.urdf", "ping.csv")]

@@ -24,6 +24,8 @@ class Utf8Path(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = super().convert(value, param, ctx)
+        if value == "":  # a variable of the shell without value, not the working directory
+            self.fail("the path is empty", param, ctx)
         try:
             str(path).encode()
         except UnicodeEncodeError:

@@ -23,6 +23,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
+from drake_teleop.common.errors import DrakeTeleopError
+
 _REPR_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
 
@@ -73,6 +75,12 @@ def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
 
 
 def address_of_function(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
+    if not isinstance(function, Dispatcher):
+        raise DrakeTeleopError(
+            "is not compiled",
+            where=f"function {getattr(function, '__qualname__', function)}",
+            remedy="decorate it with @njit(cache=True) of drake_teleop.common.compiled",
+        )
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 

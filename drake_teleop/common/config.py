@@ -132,6 +132,9 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
     """Raise DrakeTeleopError, for the place `where`, if the field cannot have this value."""
     check_field_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    if not entry.init and value != entry.default:
+        what = f"{short_text(value)} has no effect in Python (only in files)"
+        raise DrakeTeleopError(what, where=where, remedy=entry.metadata["in_python"])
     _check_field_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
 
 
@@ -327,7 +330,7 @@ class FieldInfo:
     def range(self) -> str:
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
-            return f"{self.low:.7g} to {self.high:.7g}{unit}"
+            return f"{_format_limit(self.low)} to {_format_limit(self.high)}{unit}"
         if self.choices:
             return ", ".join(self.choices)
         return " or ".join(block.__name__ for block in self.blocks)
@@ -416,7 +419,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         if "choices" in metadata
         else (),
         blocks=blocks,
-        meaning=metadata.get("doc") or _first_docstring_line(blocks[0]),
+        meaning=metadata.get("doc") or (_first_docstring_line(blocks[0]) if blocks else ""),
         is_mapping=is_mapping,
     )
 
@@ -431,6 +434,10 @@ def _format_value(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_format_value, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
+def _format_limit(limit: float | None) -> str:
+    return f"{limit:.7g}" if isinstance(limit, float) else str(limit)
 
 
 def _first_docstring_line(block: type) -> str:

@@ -109,6 +109,28 @@ def output_folder(
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
 
 
+INPUTS_FILE = "inputs.csv"
+"""Name of the file with the inputs of a recorded drive."""
+
+
+def check_inputs_are_kept(result: Path, given: str | Path | None = None) -> None:
+    """Raise DrakeTeleopError if the file `result` would replace `given` or be in a drive's folder.
+
+    A `given` that is no file, such as a shipped name, is ignored.
+    """
+    if not result.exists():
+        return
+    what = "a recorded drive" if (result.parent / INPUTS_FILE).exists() else ""
+    if given is not None and os.path.isfile(given) and os.path.samefile(given, result):
+        what = f"the input {result.name}"
+    if what:
+        raise DrakeTeleopError(
+            f"contains {what}, which the results would replace",
+            where=str(result.parent),
+            remedy="give another --out",
+        )
+
+
 def make_folder(folder: Path) -> None:
     remedy = "give another folder"
     try:

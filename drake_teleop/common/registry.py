@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import reprlib
 import sys
 from collections.abc import Mapping
 from functools import partial
@@ -25,11 +26,15 @@ class Registry(dict[str, _Part]):
     Args:
         kind: name of the kind of parts, such as "passivity method".
         shipped: parts of this package by name.
+        part_type: class of the parts, or the base class of parts that are classes; None: any.
     """
 
-    def __init__(self, kind: str, shipped: Mapping[str, _Part]) -> None:
+    def __init__(
+        self, kind: str, shipped: Mapping[str, _Part], part_type: type | None = None
+    ) -> None:
         super().__init__(shipped)
-        self.kind, self.shipped = kind, tuple(shipped)
+        self.kind, self.shipped, self._part_type = kind, tuple(shipped), part_type
+        self._parts_are_classes = all(isinstance(part, type) for part in shipped.values())
         REGISTRIES[kind] = self
 
     def register(self, name: str, part: _Part | None = None) -> Any:
@@ -46,8 +51,24 @@ class Registry(dict[str, _Part]):
             raise DrakeTeleopError(
                 f"'{name}' is the name of a shipped part", where=self.kind, remedy="use another"
             )
+        self._check_type(name, part)
         self[name] = part
         return part
+
+    def _check_type(self, name: str, part: Any) -> None:
+        if self._part_type is None:
+            return
+        if self._parts_are_classes:
+            fits = isinstance(part, type) and issubclass(part, self._part_type)
+        else:
+            fits = isinstance(part, self._part_type)
+        if not fits:
+            kind = "a class derived from " if self._parts_are_classes else ""
+            raise DrakeTeleopError(
+                f"'{name}' is {reprlib.repr(part)}",
+                where=self.kind,
+                remedy=f"register {kind}{self._part_type.__name__} (docs/extend.md)",
+            )
 
     def remove(self, name: str) -> None:
         if name in self.shipped:

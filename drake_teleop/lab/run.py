@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     CannotWrite,
+    check_inputs_are_kept,
     output_folder,
     remove_log,
     wrap_write_errors,
@@ -26,6 +27,7 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
 _LOAD_FOUND_IN_RUN = "estimated during the run"
+_SCENARIO_FILE_NAME = "scenario.yaml"
 _RESULT_FILE_NAMES = (
     "sensor_log.parquet",
     "identification.json",
@@ -75,12 +77,7 @@ def run_command(
             where="run --inputs",
             remedy="remove --seed and --fresh",
         )
-    if drive is not None and out.resolve() == drive.folder.resolve():
-        raise DrakeTeleopError(
-            "is the folder of the recorded drive, which the results would replace",
-            where=str(out),
-            remedy="give another --out",
-        )
+    check_inputs_are_kept(out / _SCENARIO_FILE_NAME, scenario)
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
@@ -109,7 +106,7 @@ def run_command(
 def _run_into_folder(
     setup: Scenario, out: Path, stage: StartStage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
-    log, scenario_file = out / "log.parquet", out / "scenario.yaml"
+    log, scenario_file = out / "log.parquet", out / _SCENARIO_FILE_NAME
     # After an interruption, old files must not look like results of this run.
     remove_log(log)
     for name in _RESULT_FILE_NAMES:

@@ -26,8 +26,6 @@ AS_IN_SCENARIO = "as in the scenario"
 NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
 SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
 
-#: Name of the file with the inputs of a recorded drive.
-INPUTS_FILE = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
 INPUT_UNIT_M, INPUT_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]

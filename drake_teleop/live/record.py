@@ -16,14 +16,15 @@ from typing import Any
 
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.common.files import make_folder, wrap_write_errors, write_text
+from drake_teleop.common.files import INPUTS_FILE, make_folder, wrap_write_errors, write_text
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
-from drake_teleop.live.inputs import INPUTS_FILE, Inputs, csv_header, csv_row
+from drake_teleop.live.inputs import Inputs, csv_header, csv_row
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.simulation import LogOnDisk
+from drake_teleop.station.slave.model.model_references import list_model_files
 
 LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 #: Marker file: the positions in the inputs are those of a haptic device.
@@ -38,7 +39,8 @@ def versions_and_file_digest(scenario: Scenario) -> dict[str, str]:
         if isinstance(value, (dict, list)):
             left.extend(value.values() if isinstance(value, dict) else value)
         elif isinstance(value, str) and os.path.isabs(value) and os.path.isfile(value):
-            digest.update(Path(value).read_bytes())
+            for file in list_model_files(Path(value), scenario.slave.package_folders):
+                digest.update(file.read_bytes())
     versions = {"drake_teleop": __version__, "drake": version("drake")}
     return versions | {"files": digest.hexdigest()[:12]}
 

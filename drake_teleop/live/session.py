@@ -15,12 +15,13 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import INPUTS_FILE
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
-from drake_teleop.live.inputs import INPUTS_FILE, SLICE_MS, Inputs, read_inputs
+from drake_teleop.live.inputs import SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.record import (
     DEVICE_MARKER_FILE,
     LOAD_FILE,

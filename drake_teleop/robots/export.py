@@ -296,5 +296,6 @@ FORMATS = Registry(
         "sdf": Format(_sdf_xml, body=True),
         "mjcf": Format(_mjcf_xml, body=True),
     },
+    Format,
 )
 """Export formats by name."""

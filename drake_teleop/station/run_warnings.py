@@ -43,6 +43,7 @@ _MIN_WARNING_SPAN_S = 0.2
 _MAX_CLOSED_SPAN_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
 _SHARE_AT_LIMIT = 1 - 1e-9
+_SHARE_AT_MOTOR_LIMIT = 0.999  # of a leader's motors, which the joints' motion changes
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_COMMAND_LAG_M = 2e-3
 _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
@@ -145,6 +146,8 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
         if isinstance(device, LeaderDevice):
             full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
+            joints = result["master_state"][:, : device.num_joints]
+            full |= device.is_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)

@@ -4,7 +4,6 @@
 import copy
 import dataclasses
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -51,11 +50,14 @@ from drake_teleop.station.slave.slave_config import Slave
 
 _T = TypeVar("_T")
 ENVIRONMENTS: Registry[type[Environment]] = Registry(
-    "environment", {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)}
+    "environment",
+    {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)},
+    Environment,
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
 _MAX_CONTACT_STEP_S = 1.25e-4
+_MIN_SCALE_WITH_METHOD = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
 @settings
@@ -64,7 +66,9 @@ class Rates:
     """Sampling rates. Those of the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
-    hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
+    hand_hz: float = quantity(
+        2000.0, "Hz", 10.0, 1e5, "haptic device and channel; 1 kHz or more with a simulated device"
+    )
     joint_control_hz: float = quantity(
         2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz it samples inside steps"
     )
@@ -188,14 +192,12 @@ def ScenarioNames() -> list[str]:
 def LoadScenario(name_or_path: str | Path) -> Scenario:
     """Load a shipped scenario by name, or a YAML file.
 
-    Missing fields keep their defaults. Paths of models are relative to the file's folder.
+    Missing fields keep their defaults. Paths in it are relative to the file's folder.
 
     Raises:
         DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
-    data, where = ReadScenarioData(name_or_path)
-    scenario: Scenario = with_absolute_paths(ScenarioFromData(data, where), Path(where).parent)
-    return scenario
+    return ScenarioFromData(*ReadScenarioData(name_or_path))
 
 
 def ReadScenarioData(name_or_path: str | Path) -> tuple[Any, str]:
@@ -235,22 +237,25 @@ def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | N
 def ScenarioFromData(data: Any, where: str) -> Scenario:
     """Convert parsed YAML data to a checked scenario, or raise DrakeTeleopError.
 
-    `where` is the file's name for messages.
+    `where` is the file's name for messages. Paths in the data are relative to its folder.
     """
     check_structure(Scenario, data, where)  # before the presets are read
-
-    def find_preset(table: Mapping[str, Any], block: str, field: str) -> Any:
-        return copy.deepcopy(table.get(str((data.get(block) or {}).get(field))))
-
-    interface = find_preset(POSITION_INTERFACES, "joint_control", "servo")
-    defaults = Scenario(
-        wrist_sensor=find_preset(PRESETS, "wrist_sensor", "preset") or WristSensorConfig(),
-        master=Master(figures=find_preset(FIGURES, "master", "model")),
-        joint_control=JointControlConfig(interface=interface),
+    blocks = {name: block or {} for name, block in data.items()}
+    master, sensor, control = (
+        blocks.get(name, {}) for name in ("master", "wrist_sensor", "joint_control")
     )
+    defaults = Scenario(
+        wrist_sensor=copy.deepcopy(PRESETS.get(sensor.get("preset"), WristSensorConfig()))
+    )
+    if master.get("figures") is not None:  # changes the data sheet
+        defaults.master.figures = copy.deepcopy(FIGURES.get(master.get("model")))
+    if control.get("interface") is not None:
+        interface = copy.deepcopy(POSITION_INTERFACES.get(control.get("servo")))
+        defaults.joint_control.interface = interface
     scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
-    return scenario
+    absolute: Scenario = with_absolute_paths(scenario, Path(where).parent)
+    return absolute
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:
@@ -317,7 +322,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
-    if scenario.passivity.method != "none" and min(scales) == 0.0:
-        what = "passivity methods require kinematic scales above 0"
-        remedy = "set both scales of kinematic_scaling above 0, or method: none"
+    if scenario.passivity.method != "none" and min(scales) < _MIN_SCALE_WITH_METHOD:
+        what = f"passivity methods require kinematic scales of {_MIN_SCALE_WITH_METHOD:g} or more"
+        remedy = "increase both scales of kinematic_scaling, or set method: none"
         raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

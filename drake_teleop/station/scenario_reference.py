@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.common.config import FieldInfo, fields_of
+from drake_teleop.common.config import FieldInfo, fields_of, with_absolute_paths
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
 from drake_teleop.common.texts import format_yaml_value, parse_yaml
@@ -67,11 +67,10 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
     A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
+    scenario = with_absolute_paths(scenario, Path.cwd())
     text = "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario)
     where = str(path)
     found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
-    if scenario.master.figures is None:  # read from the data sheet
-        found.master = dataclasses.replace(found.master, figures=None)
     if found != scenario and _texts_in(found) != _texts_in(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
         lost = [n for n in names if _texts_in(getattr(found, n)) != _texts_in(getattr(scenario, n))]

@@ -11,13 +11,12 @@ from pydrake.systems.analysis import Simulator
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import models_dir
+from drake_teleop.common.files import INPUTS_FILE, models_dir
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import TARGET_LEAD_TIME_S
 from drake_teleop.live.inputs import (
     INPUT_RANGES,
-    INPUTS_FILE,
     Inputs,
     csv_header,
     csv_row,

@@ -380,7 +380,7 @@ def test_ports_agree_with_the_state():
 
 
 def test_long_period_or_start_beyond_limit_is_rejected():
-    with pytest.raises(DrakeTeleopError, match=r"master\.period"):
+    with pytest.raises(DrakeTeleopError, match=r"rates\.hand_hz"):
         device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE_RAD)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
         device.MasterDevice(5e-4, Master().device(0.1, 1e-4), np.array([2.0, 0, 0, 0, 0, 0]))

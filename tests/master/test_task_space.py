@@ -148,9 +148,11 @@ def test_file_selects_device_and_overrides_figures():
     expected = dataclasses.replace(FIGURES["omega_3"], friction=0.1)
     assert scenario.master.figures == expected
     named = ScenarioFromData({"master": {"model": "falcon"}}, "mine.yaml")
-    devices = named.master.device(*HAND), Master(model="falcon").device(*HAND)
-    for found, wanted in zip(*(each.parameters for each in devices), strict=True):
-        np.testing.assert_array_equal(found, wanted)
+    other = replace(named, master__model="omega_7")  # its data sheet, not the falcon's
+    for scenario, model in ((named, "falcon"), (other, "omega_7")):
+        devices = scenario.master.device(*HAND), Master(model=model).device(*HAND)
+        for found, wanted in zip(*(each.parameters for each in devices), strict=True):
+            np.testing.assert_array_equal(found, wanted)
     for block, where in (
         ({"figures": {"friction": 0.1}}, "figures"),
         ({"model": "falcon", "friction": {"coulomb": [0.1] * 6}}, "friction"),

@@ -13,12 +13,13 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydrake.common.yaml import yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_load
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.scenario import Scenario, replace, settings_from_data
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK_SIZE,
@@ -119,7 +120,7 @@ def test_the_default_is_the_sensor_of_the_paper():
 # Calibration and place
 
 
-@given(unit=st.integers(0, 2**32), bound=st.floats(1e-4, 0.05))
+@given(unit=st.integers(0, 2**32 - 1), bound=st.floats(1e-4, 0.05))
 @settings(max_examples=50, deadline=None)
 def test_calibration_errors_stay_inside_their_bounds(unit, bound):
     ranges = BARE.ranges()[:6]
@@ -488,9 +489,9 @@ def test_invalid_sensor_is_rejected(changes, message):
 
 
 def loaded(text):
-    preset = PRESETS.get(yaml_load(data=text).get("preset"), WristSensorConfig())
-    defaults = copy.deepcopy(preset)
-    config = yaml_load_typed(schema=WristSensorConfig, data=text, defaults=defaults)
+    data = yaml_load(data=text)
+    preset = copy.deepcopy(PRESETS.get(data.get("preset"), WristSensorConfig()))
+    config = settings_from_data(WristSensorConfig, data, "sensor", preset)
     check_ranges(config, "sensor")
     return config
 
@@ -511,6 +512,10 @@ def test_preset_without_effect_is_rejected():
         WristSensorConfig(preset="ati_gamma_imu")
     with pytest.raises((TypeError, ValueError), match="preset"):
         dataclasses.replace(WristSensorConfig(), preset="ati_gamma_imu")
+    with pytest.raises(DrakeTeleopError, match=r"preset: 'ideal' has no effect in Python"):
+        WristSensorConfig().preset = "ideal"
+    with pytest.raises(DrakeTeleopError, match=r"preset: 'ideal' has no effect in Python"):
+        replace(Scenario(), wrist_sensor__preset="ideal")
 
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "sensor.md").read_text(encoding="utf-8")

@@ -162,6 +162,15 @@ def test_mesh_outside_folder_is_removed_with_remedy(tmp_path: Path, where: str) 
     assert not any("shapes" in words for words in parse(path).assumptions)
 
 
+def test_missing_package_folder_is_an_error(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text("<robot/>")
+    with pytest.raises(
+        DrakeTeleopError, match=r"there is no folder .*/typo for its packages; corr"
+    ):
+        parse(path, (tmp_path / "typo",))
+
+
 @pytest.mark.parametrize("case", ["installed", "source", "no package", "home", "link", "neighbour"])
 def test_model_reads_files_of_the_installed_python_package_around_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str

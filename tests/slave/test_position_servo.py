@@ -128,6 +128,12 @@ def test_invalid_interface_raises_one_error(changes, where):
         scenario.check()
 
 
+def test_another_servo_has_its_own_interface():
+    named = ScenarioFromData({"joint_control": {"servo": "franka_position"}}, "x")
+    other = replace(named, joint_control__servo="ur_servoj").joint_control
+    assert other.position_interface == POSITION_INTERFACES["ur_servoj"]
+
+
 def test_scenario_overrides_single_interface_fields():
     data = {"joint_control": {"servo": "franka_position", "interface": {"dead_time": 0.01}}}
     found = ScenarioFromData(data, "x").joint_control.position_interface

@@ -291,6 +291,18 @@ def test_folder_of_another_study_is_refused(serial, files):
     assert parts(serial[1]) == before
 
 
+def test_folder_of_another_arm_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies.StationRunFunction, "__call__", lambda *_: {"hand_work_J": 1.0})
+    study = "{scenario: base.yaml, factors: [{field: force_scaling.sigma, values: [0]}]}"
+    files = {"base.yaml": "slave: {model: arm.urdf}", "study.yaml": study, "arm.urdf": "<robot/>"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    study_command(tmp_path / "study.yaml", tmp_path / "out", jobs=1, quiet=True)
+    (tmp_path / "arm.urdf").write_text("<robot></robot>")
+    with pytest.raises(DrakeTeleopError, match="another study"):
+        study_command(tmp_path / "study.yaml", tmp_path / "out", jobs=1, quiet=True)
+
+
 @pytest.mark.parametrize("damage", ["empty", "no rows", "damaged"])
 def test_empty_part_is_repeated_and_other_files_are_ignored(tmp_path, damage):
     study = Study(factors=[Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0])], measures=[])
@@ -570,6 +582,12 @@ def test_measures_of_a_known_motion():
     )
 
 
+def test_run_without_a_hand_has_no_measures():
+    result = SimulationResult(np.arange(3.0), {}, [])
+    with pytest.raises(DrakeTeleopError, match=r"operator\.intent: the run identifies the load"):
+        evaluate_measures(result, Scenario(), default_measures(), 1.0)
+
+
 def test_preset_as_factor_sets_its_values():
     work = studies.StationRunFunction({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
@@ -678,6 +696,20 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "500"))
     with pytest.raises(RunBegun):
         study_command(path, out, yes=lambda question: pytest.fail("nobody need ask"))
+
+
+def test_paths_of_the_scenario_are_relative_to_its_file(tmp_path):
+    data = {
+        "slave": {"model": "arm.sdf", "package_paths": ["meshes"], "tool": {"model": "tool.sdf"}},
+        "channel": {"trace": "ping.csv", "backward": {"trace": "pong.csv"}},
+    }
+    work = studies.StationRunFunction(data, str(tmp_path / "base.yaml"), (), 1.0)
+    scenario = work.scenario({"force_scaling.sigma": 0.5}, 1)
+    slave, channel = scenario.slave, scenario.channel
+    read = [slave.model, *slave.package_paths, slave.tool.model]
+    read += [channel.trace, channel.backward.trace]
+    names = ("arm.sdf", "meshes", "tool.sdf", "ping.csv", "pong.csv")
+    assert read == [str(tmp_path / name) for name in names]
 
 
 def test_missing_study_file_is_an_error(tmp_path):

@@ -28,13 +28,24 @@ from drake_teleop.station.scenario import LoadScenario, replace
 GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
 
 
-def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
-    stated = make_stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
+def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_ends():
+    stated = make_stated_set(["firm", "light"], [20.0, 0.5, 3.0], "press")
     assert stated.hands == ("light", "medium", "firm")
     assert stated.walls == (500.0, 20000.0)
     assert stated.corners == [
         ("light", 20000.0), ("firm", 20000.0), ("light", 500.0), ("firm", 500.0),
     ]  # fmt: skip
+    walls = pytest.approx([20000.0 * 40 ** (-k / 3) for k in range(4)])
+    assert stated.tested_parts == [
+        (1.1, ["light"], walls),
+        (1.1, ["light"], walls),
+        (1.1, ["medium", "firm"], walls),
+        (1.0, ["light", "firm"], [20000.0]),
+    ]
+    assert make_stated_set(["light"], [3.0], "press").tested_parts == [
+        *(2 * [(1.1, ["light"], [3000.0])]),
+        (1.0, ["light"], [3000.0]),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -79,21 +90,41 @@ def test_only_force_above_5_hz_counts_as_oscillation():
 
 
 @pytest.mark.parametrize(
-    "change", [{"rests": 0.0}, {"rest_force_N": 1.2 * MAX_REST_FORCE_N}, {"share": 0.8}]
+    "change",
+    [{"rests": 0.0}, {"rest_force_N": 1.2 * MAX_REST_FORCE_N}, {"share": 0.8}, {"share": 1.2}],
 )
 def test_station_holds_only_if_it_rests_quietly_and_renders_the_force(change):
     assert meets_requirements(GOOD)
     assert not meets_requirements(GOOD | change)
 
 
-class FakeStation:
-    """Station that is stable with `ledger` below a product of gamma and wall."""
+def test_tuned_settings_render_the_force_more_exactly_than_required():
+    class Inexact(FakeStation):
+        def __call__(self, name, study, work):
+            rows = super().__call__(name, study, work)
+            if name.startswith("station"):
+                for row in rows:
+                    row["share"] = 0.91 if row["gamma"] > 1.0 else 0.95
+            return rows
 
-    def __init__(self, limit: float, one_axis_limit: float) -> None:
-        self.limit, self.one_axis_limit, self.names = limit, one_axis_limit, []
+    found = search_settings(trial(), Inexact(limit=np.inf, one_axis_limit=2.2))
+    assert 1.1 * found.settings.gamma <= 1.0
+
+
+class FakeStation:
+    """Station that is stable with `ledger` below a product of gamma and wall.
+
+    `noise` [N] is the force at rest for gamma = 1. With a medium grip, walls softer than the
+    stiffest one fail above `soft_wall_limit`.
+    """
+
+    def __init__(
+        self, limit: float, one_axis_limit: float, noise=1e-3, soft_wall_limit: float = np.inf
+    ) -> None:
+        self.limit, self.one_axis_limit, self.runs = limit, one_axis_limit, {}
+        self.noise, self.soft_wall_limit = noise, soft_wall_limit
 
     def __call__(self, name, study, work):
-        self.names.append(name)
         rows = [dict(point) for point in study.points()]
         for row in rows:
             if name == "search":
@@ -101,7 +132,12 @@ class FakeStation:
                 row |= {"gamma_limit": limit, "linear_limit": 0.0, "share": 0.95}
             else:
                 row |= GOOD | {"threshold_N": 1.0 / row["gamma"]}
-                row["rests"] = float(row["gamma"] * row["wall"] <= self.limit)
+                row["rest_force_N"] = self.noise * row["gamma"]
+                stable = row["gamma"] * row["wall"] <= self.limit
+                if row["hand"] == "medium" and row["wall"] < 20000.0:
+                    stable &= row["gamma"] <= self.soft_wall_limit
+                row["rests"] = float(stable)
+        self.runs[name] = rows
         return rows
 
 
@@ -117,8 +153,11 @@ def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
     found = search_settings(trial(), FakeStation(limit=np.inf, one_axis_limit=2.2))
     assert (found.settings.method, found.settings.sigma_inertia) == ("ledger", 0.0)
     assert found.settings.gamma == pytest.approx(2.2 / 1.1)
-    assert {row["wall"] for row in found.limit_runs} == {20000.0, 24000.0, 40000.0}
-    assert all(row["gamma"] == found.settings.gamma for row in found.limit_runs)
+    gamma = found.settings.gamma
+    beyond = [
+        (row["wall"], row["gamma"] / gamma) for row in found.beyond_runs if row["hand"] == "firm"
+    ]
+    assert beyond == [(20000.0, pytest.approx(1.32)), (24000.0, 1.0), (40000.0, 1.0)]
 
 
 def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin():
@@ -126,11 +165,32 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     station = FakeStation(limit=limit, one_axis_limit=2.2)
     found = search_settings(trial(), station)
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
-    assert {row["gamma"] for row in found.corner_runs} == {1.1 * found.settings.gamma}
-    assert {(row["hand"], row["wall"]) for row in found.corner_runs} == set(
-        trial().stated_set.corners
+    gamma = found.settings.gamma
+    assert {row["gamma"] for row in found.inside_runs} == {1.1 * gamma, gamma}
+    assert len({(row["hand"], row["wall"]) for row in found.inside_runs}) == 3 * 4
+    assert not all(meets_requirements(row) for row in found.beyond_runs)
+
+
+def test_search_tests_grips_and_walls_between_the_ends():
+    found = search_settings(
+        trial(), FakeStation(limit=np.inf, one_axis_limit=2.2, soft_wall_limit=1.0)
     )
-    assert not all(meets_requirements(row) for row in found.limit_runs)
+    assert 1.1 * found.settings.gamma <= 1.0 < 1.1 * 1.15 * found.settings.gamma
+
+
+def test_search_takes_the_gamma_of_accepted_noise_in_few_tries():
+    station = FakeStation(limit=np.inf, one_axis_limit=2.2, noise=0.03)
+    found = search_settings(trial(), station)
+    accepted = MAX_REST_FORCE_N / (1.1 * 0.03)
+    assert accepted / 1.1 <= found.settings.gamma <= accepted
+    assert [name[-2:] for name in station.runs if "station" in name] == [
+        "_0",
+        "_0",
+        "_1",
+        "_2",
+        "_3",
+    ]
+    assert not all(meets_requirements(row) for row in found.beyond_runs)
 
 
 def test_search_refuses_a_set_that_no_settings_hold():

@@ -73,7 +73,8 @@ def new_command(
         with whole_file(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
-            read = [slave.path, *slave.package_folders, *(slave.model_files()[1:] if tool else ())]
+            read = [slave.path, *slave.package_folders]
+            read += [slave.tool.path] if tool and slave.tool else []
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
                 raise DrakeTeleopError(

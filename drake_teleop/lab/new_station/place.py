@@ -394,19 +394,23 @@ def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) 
     """Return advice on a sensor frame with z along the tool; empty: not needed."""
     if axis == "z":
         return ""
-    R_SA = TOOL_AXES[axis]
+    R_SA, name = TOOL_AXES[axis], f"{sensor_frame}_z_to_tool"
     rpy = " ".join(f"{angle + 0.0:.5g}" for angle in RollPitchYaw(R_SA).vector())
+    degrees = ", ".join(f"{angle + 0.0:.5g}" for angle in np.degrees(RollPitchYaw(R_SA).vector()))
     quaternion = " ".join(f"{part + 0.0:.5g}" for part in R_SA.ToQuaternion().wxyz())
     lines = {
-        ".xml": f'<body name="ft" quat="{quaternion}"/> in the body {sensor_frame}',
-        ".sdf": f'<frame name="ft" attached_to="{sensor_frame}"><pose>0 0 0 {rpy}</pose></frame>',
+        ".xml": f'<body name="{name}" quat="{quaternion}"/> in the body {sensor_frame}',
+        ".sdf": f'<frame name="{name}" attached_to="{sensor_frame}"><pose>0 0 0 {rpy}</pose>'
+        "</frame>",
+        ".yaml": f"- add_frame: {{name: {name}, X_PF: {{base_frame: MODEL::{sensor_frame},"
+        f" rotation: !Rpy {{deg: [{degrees}]}}}}}}",
     }
     urdf = (
-        f'<link name="ft"/><joint name="ft_joint" type="fixed"><parent link="{sensor_frame}"/>'
-        f'<child link="ft"/><origin rpy="{rpy}"/></joint>'
+        f'<link name="{name}"/><joint name="{name}_joint" type="fixed">'
+        f'<parent link="{sensor_frame}"/><child link="{name}"/><origin rpy="{rpy}"/></joint>'
     )
     return (
         f"the tool points along {axis}_S, so the start is in slave.home and the contact point in"
         f" slave.tip; to use position, or another direction, add to {model.name}"
-        f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame ft"
+        f" {lines.get(model.suffix.lower(), urdf)} and give --sensor-frame {name}"
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.operator.task import TASK_MEASURE_NAMES
 from drake_teleop.station.result import SimulationResult
@@ -68,6 +69,12 @@ def evaluate_measures(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
     """Return the measures `names` of one run; `force_threshold` in N."""
+    if "force_to_master" not in result:
+        raise DrakeTeleopError(
+            "the run identifies the load without a hand, so it has no measures",
+            where="operator.intent",
+            remedy="give the operator an intent or a task, or set load_estimator.enabled: false",
+        )
     own = [name for name in names if name in _MEASURES_OF_EVERY_RUN]
     found = {name: _MEASURES_OF_EVERY_RUN[name](result, force_threshold) for name in own}
     if len(own) < len(names):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +100,8 @@ def study_command(
     study.check_num_runs(str(path), yes)
     known = study.scenario in ScenarioNames()
     data, where = ReadScenarioData(study.scenario if known else path.parent / study.scenario)
-    ScenarioFromData(data, where)
+    slave = ScenarioFromData(data, where).slave
+    models = [sha256(file.read_bytes()).hexdigest() for file in slave.model_files()]
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
@@ -109,8 +111,8 @@ def study_command(
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
-        study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
-        shard=shard, merge=merge, progress=shown,
+        study, out, work, {"data": data, "models": models}, jobs=jobs, cluster=cluster,
+        executor=executor, shard=shard, merge=merge, progress=shown,
     )  # fmt: skip
     summary = _summarise_measures(study, rows)
     out = parse_shard(shard).folder(out) if shard else out

@@ -1,6 +1,7 @@
 """Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
 
-Limit of the linear loop; simulation in one axis; the whole station at the corners of the set.
+Limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
+its softest and stiffest wall and between them, with several seeds.
 """
 
 from __future__ import annotations
@@ -19,26 +20,30 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
     GIVEN_SETTINGS_NAME,
+    MAX_RENDERED_FORCE_ERROR,
     MAX_REST_FORCE_N,
-    MIN_RENDERED_FORCE_SHARE,
+    MAX_TUNED_FORCE_ERROR,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
     GammaSearch,
     StationTrial,
     TunedSettings,
+    renders_force,
     settings_from_values,
 )
 
 CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
-"""Candidates; others are dominated by them or render less force than `MIN_RENDERED_FORCE_SHARE`."""
+"""Candidates; others are dominated by them or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
 STIFFEST_WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
+BEYOND_MARGIN_FACTOR = 1.2
+"""Factor of the margin of gamma, at which they are searched too."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
-_MAX_GAMMA_HALVINGS = 4  # of gamma, until the station is stable
+_MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
-_MAX_NOISE_SHARE = 0.8  # share of the largest force at rest that noise may use
+_NOISE_STEP = 1.03  # gamma fails and holds by so much above and below that of accepted noise
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -51,20 +56,21 @@ class SearchResult:
     Attributes:
         searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
         given_runs: runs of the user's settings at the stiffest wall.
-        corner_runs: runs of the chosen settings for extreme hands and walls, gamma times margin.
-        limit_runs: runs of the chosen settings at the stiffest wall and at stiffer ones.
+        inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
+        beyond_runs: runs with a larger gamma, then at stiffer walls.
     """
 
     settings: TunedSettings
     searched_settings: list[Row]
     given_runs: list[Row]
-    corner_runs: list[Row]
-    limit_runs: list[Row]
+    inside_runs: list[Row]
+    beyond_runs: list[Row]
 
 
 def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest force."""
     base, stated = trial.base_scenario, trial.stated_set
+    margin = stated.requirements.loop_gain_margin
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
@@ -75,16 +81,16 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
     )
     quiet = execute(
         "noise",
-        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends[-1:], [stiffest]),
+        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends, [stiffest]),
         trial,
     )
-    noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
+    noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
         low_passes += [f for f in _LOW_PASSES_HZ if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
-    highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
-    caps = {f: min(_MAX_NOISE_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    highest = margin / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
+    caps = {f: min(MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
     study = Study(
         factors=[
             Factor(field="method", words=list(CANDIDATE_METHODS)),
@@ -115,56 +121,53 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    walls = [stiffest, *(factor * stiffest for factor in STIFFEST_WALL_FACTORS)]
-    limits = execute("limits", _study_of_settings(chosen, ends, walls), trial)
-    return SearchResult(chosen, search, given, inside, limits)
+    larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
+    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
+    walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
+    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
+    return SearchResult(chosen, search, given, inside, beyond)
 
 
 def _find_gamma_limit_in_station(
     settings: TunedSettings, trial: StationTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    margin, ends = (
-        trial.stated_set.requirements.loop_gain_margin,
-        [c[0] for c in trial.stated_set.corners],
-    )
-    hands = list(dict.fromkeys(ends))
-    tries = 0
+    """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
 
-    def run_at_gamma(gamma: float) -> list[Row]:
-        nonlocal tries
-        tried = dataclasses.replace(settings, gamma=margin * gamma)
+    def holds(rows: list[Row]) -> bool:
+        return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
+
+    gamma, stable, failed = settings.gamma, 0.0, np.inf
+    smallest = gamma / _MAX_GAMMA_REDUCTION
+    inside: list[Row] = []
+    while gamma >= smallest:
         rows: list[Row] = []
-        # The stiffest wall first: it fails more often.
-        for wall in dict.fromkeys(trial.stated_set.walls[::-1]):
-            name = f"station_{settings.method}_{tries}_{wall:.0f}"
-            rows += execute(name, _study_of_settings(tried, hands, [wall]), trial)
-            if not all(meets_requirements(row, margin) for row in rows):
-                rows = []
+        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
+            tried = dataclasses.replace(settings, gamma=factor * gamma)
+            name = f"station_{settings.method}_{gamma:.6g}_{seed}"
+            rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
+            if not holds(rows):
                 break
-        tries += 1
-        return rows
-
-    gamma, failed, inside = settings.gamma, 0.0, []
-    for _ in range(1 + _MAX_GAMMA_HALVINGS):
-        inside = run_at_gamma(gamma)
-        if inside:
-            break
-        gamma, failed = gamma / 2, gamma
-    if not inside:
-        return gamma, []
-    while failed > _MAX_UNSTABLE_OVER_STABLE_GAMMA * gamma:
-        middle = float(np.sqrt(gamma * failed))
-        if rows := run_at_gamma(middle):
-            gamma, inside = middle, rows
         else:
-            failed = middle
-    return gamma, inside
+            stable, inside = gamma, rows
+        if stable < gamma:
+            failed, smaller = gamma, gamma / 2
+            if holds([row | {"rest_force_N": 0.0} for row in rows]):
+                # Noise grows with gamma.
+                quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
+                smaller = max(smaller, quiet / _NOISE_STEP)
+                failed = min(failed, quiet * _NOISE_STEP)
+        if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
+            break
+        gamma = float(np.sqrt(stable * failed)) if stable else smaller
+    return stable, inside
 
 
-def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
+def meets_requirements(
+    row: Mapping[str, Any], max_force_error: float = MAX_RENDERED_FORCE_ERROR
+) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
-    quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and row["share"] >= MIN_RENDERED_FORCE_SHARE)
+    quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
+    return bool(row["rests"] and quiet and renders_force(row["share"], max_force_error))
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
@@ -204,7 +207,14 @@ def _rms_load_force_in_swing(trial: StationTrial) -> float:
     return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of_settings(settings: TunedSettings, hands: list[str], walls: list[float]) -> Study:
+def _study_of_settings(
+    settings: TunedSettings,
+    hands: list[str],
+    walls: list[float],
+    *,
+    seed: int = 0,
+    repeats: int = 1,
+) -> Study:
     factors = [
         Factor(field="method", words=[settings.method]),
         Factor(field="gamma", values=[settings.gamma]),
@@ -213,4 +223,4 @@ def _study_of_settings(settings: TunedSettings, hands: list[str], walls: list[fl
         Factor(field="hand", words=hands),
         Factor(field="wall", values=walls),
     ]
-    return Study(factors=factors, measures=TRIAL_MEASURES)
+    return Study(factors=factors, measures=TRIAL_MEASURES, seed=seed, repeats=repeats)

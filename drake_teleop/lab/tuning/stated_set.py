@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
@@ -16,6 +18,7 @@ from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 
 _MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
+_NUM_TESTED_WALLS = 4  # from the softest to the stiffest
 _MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
 
 
@@ -45,7 +48,7 @@ class StatedSet:
     """Hands, walls and task for which the settings must hold.
 
     Args:
-        hands: names of grips, softest first.
+        hands: names of all grips from the softest to the firmest.
         walls: lowest and highest stiffness [N/m].
         task: key of `REQUIREMENTS_OF_TASK`.
     """
@@ -59,6 +62,18 @@ class StatedSet:
         """Softest and firmest grip at the softest and stiffest wall; the stiffest wall first."""
         hands = dict.fromkeys((self.hands[0], self.hands[-1]))
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
+
+    @property
+    def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
+        """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
+
+        The softest grip fails first: it is tested twice. The last part has no margin.
+        """
+        low, high = self.walls
+        margin, hands = self.requirements.loop_gain_margin, list(self.hands)
+        walls = np.geomspace(high, low, _NUM_TESTED_WALLS if low < high else 1).tolist()
+        parts = [(margin, part, walls) for part in (hands[:1], hands[:1], hands[1:]) if part]
+        return [*parts, (1.0, [*dict.fromkeys((hands[0], hands[-1]))], [high])]
 
     @property
     def requirements(self) -> TaskRequirements:
@@ -89,8 +104,11 @@ def make_stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> 
         raise DrakeTeleopError(
             "no wall stiffness is given", where="walls", remedy="give kN/m, such as 0.5,20"
         )
-    ordered = tuple(name for name in GRIP_IMPEDANCES if name in hands)
-    return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
+    grips = list(GRIP_IMPEDANCES)
+    places = sorted(map(grips.index, hands))
+    return StatedSet(
+        tuple(grips[places[0] : places[-1] + 1]), (1e3 * min(walls), 1e3 * max(walls)), task
+    )
 
 
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:

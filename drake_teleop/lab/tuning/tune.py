@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_teleop.common.files import (
+    check_inputs_are_kept,
     make_folder,
     output_folder,
     write_json,
@@ -65,6 +66,8 @@ def tune(
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), make_stated_set(hands, walls, task)
+    if not isinstance(scenario, Scenario):
+        check_inputs_are_kept(out / "tuned.yaml", scenario)
     base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
@@ -113,22 +116,29 @@ def tune(
 def _make_tuning_summary(
     found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
-    at_edge = [row for row in found.limit_runs if row["wall"] <= stated.walls[1]]
-    scale = tuned.force_scaling.force_scale
-    failed = [row for row in found.limit_runs if not meets_requirements(row)]
+    scale, gamma = tuned.force_scaling.force_scale, found.settings.gamma
+    failed = [row for row in found.beyond_runs if not meets_requirements(row)]
+    shares = [row["share"] for row in found.inside_runs]
+    edge = [row for row in found.inside_runs if row["gamma"] == gamma]  # without margin
     worst_given = max(row["threshold_N"] for row in found.given_runs)
     figures = {
-        "share": min(row["share"] for row in [*found.corner_runs, *at_edge]),
-        "threshold_N": max(row["threshold_N"] for row in at_edge),
+        "share": min(shares),
+        "largest_share": max(shares),
+        "threshold_N": max(row["threshold_N"] for row in edge),
         "given_threshold_N": worst_given
         if all(map(meets_requirements, found.given_runs))
         else None,
-        "rest_force_N": max(row["rest_force_N"] for row in at_edge),
+        "rest_force_N": max(row["rest_force_N"] for row in edge),
         "margin": stated.requirements.loop_gain_margin,
-        "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
+        "fails_at": {
+            "hand": failed[0]["hand"],
+            "wall_N_per_m": failed[0]["wall"],
+            "gamma_factor": failed[0]["gamma"] / gamma,
+        }
         if failed
         else None,
-        "beyond_N_per_m": max(row["wall"] for row in found.limit_runs),
+        "beyond_N_per_m": max(row["wall"] for row in found.beyond_runs),
+        "beyond_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
     }
     settings = dataclasses.asdict(found.settings) | {"sigma_weight": 0.0, "force_scale": scale}
     about = {
@@ -143,7 +153,7 @@ def _make_tuning_summary(
         "figures": figures,
         "sentences": _tuning_result_sentences(found.settings, figures, about, scale),
         "search": found.searched_settings,
-        "trials": [*found.given_runs, *found.corner_runs, *found.limit_runs],
+        "trials": [*found.given_runs, *found.inside_runs, *found.beyond_runs],
     }
 
 
@@ -160,19 +170,25 @@ def _tuning_result_sentences(
         f"Take passivity.method {chosen.method}, gamma {chosen.gamma:.2f}, sigma_weight 0, "
         f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {scale:.4g}, and a low-pass of "
         f"{chosen.low_pass_hz:g} Hz.",
-        f"The station is stable for a {hands} grip at walls of {low:g} and {high:g} kN/m over "
+        f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
         f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
-        f"It renders {figures['share']:.2f} of the scaled contact force at least; above 5 Hz the "
-        f"force at rest has {figures['rest_force_N']:.3f} N rms.",
+        f"It renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
+        f"contact force; above 5 Hz the force at rest has {figures['rest_force_N']:.3f} N rms.",
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
         f"at the tool; {instead}.",
     ]
     fails = figures["fails_at"]
     if fails is None:
-        last = f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m."
+        last = (
+            f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
+            f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
+        )
     else:
-        wall = fails["wall_N_per_m"] / 1e3
-        last = f"It first fails with a {fails['hand']} grip at a wall of {wall:g} kN/m."
+        wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
+        last = (
+            f"It fails with a {fails['hand']} grip at a wall of {wall:g} kN/m and gamma "
+            f"{factor:.2f} times as large."
+        )
     return [*lines, last]
 
 

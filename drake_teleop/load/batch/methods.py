@@ -160,6 +160,7 @@ METHODS = Registry(
         "total": Method("total least squares", _fit_total_least_squares),
         "consistent": Method("physically consistent least squares", _fit_consistent),
     },
+    Method,
 )
 """Estimators by name."""
 

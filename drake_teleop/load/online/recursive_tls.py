@@ -393,6 +393,8 @@ def _regularized_cholesky(A: Array) -> Array:
 
 
 METHODS: Registry[type[RecursiveEstimator]] = Registry(
-    "recursive estimator", {"rls": RecursiveLeastSquares, "rtls": RecursiveTotalLeastSquares}
+    "recursive estimator",
+    {"rls": RecursiveLeastSquares, "rtls": RecursiveTotalLeastSquares},
+    RecursiveEstimator,
 )
 """Recursive estimators by name."""

@@ -57,9 +57,11 @@ class NetworkConfig:
     redundant: bool = plain(False, "packets repeat the samples that the playout buffer may await")
     trace: str | None = plain(
         None,
-        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "
-        "the columns `time` [s], increasing, and `delay` [s], one-way, empty if the packet was "
-        "lost; between its rows the last one holds, after its end it starts again",
+        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file, "
+        "from the scenario's folder, with the columns `time` [s], increasing, and `delay` [s], "
+        "one-way, empty if the packet was lost; between its rows the last one holds, after its end "
+        "it starts again",
+        is_path=True,
     )
     silence: str = choice(
         "hold",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.config import choice, quantity, settings
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.common.registry import Registry
@@ -94,6 +94,7 @@ FIGURES = Registry(
         name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELD_NAMES, copy.deepcopy(row), strict=True)))
         for name, row in _DATA_SHEETS.items()
     },
+    DeviceFigures,
 )
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
@@ -115,7 +116,9 @@ class Master:
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
     friction: JointFriction = field(default_factory=JointFriction)
-    figures: DeviceFigures | None = None
+    figures: DeviceFigures | None = plain(
+        None, "values in place of those of the device's data sheet; null: the data sheet's"
+    )
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:

@@ -33,10 +33,10 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_DEVICE_PERIOD_S:
         raise DrakeTeleopError(
-            f"the haptic device's period of {period:g} s is not above 0 and at most "
-            f"{_MAX_DEVICE_PERIOD_S:g} s",
-            where="master.period",
-            remedy="choose a hand rate of 1 kHz or more; the paper uses above 2 kHz",
+            f"a period of {period:g} s is too long to simulate a haptic device (at most"
+            f" {_MAX_DEVICE_PERIOD_S:g} s)",
+            where="rates.hand_hz",
+            remedy="choose 1000 Hz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)

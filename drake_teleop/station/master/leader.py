@@ -158,6 +158,17 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
         shortened[k] = share * wrench[k]
 
 
+@njit(cache=True)
+def _flag_motors_at_limit(arm_without_hand, arm, joint_table, q, F, share):
+    rows, n = q.shape
+    flags, torque = np.zeros(rows, np.bool_), np.empty(n)
+    for row in range(rows):
+        motor_torques_into(arm_without_hand, arm, joint_table, q[row], F[row], torque)
+        for i in range(n):
+            flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
+    return flags
+
+
 @dataclass(frozen=True)
 class LeaderDevice(HapticDeviceBase):
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
@@ -222,6 +233,15 @@ class LeaderDevice(HapticDeviceBase):
                 where="master.leader.home",
                 remedy="start within the limits of its joints",
             )
+
+    def is_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
+        """Return flags (N,): True if a motor has `share` of its torque limit or more.
+
+        The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
+        """
+        tables = self.compiled_constants
+        flags: NDArray[np.bool_] = _flag_motors_at_limit(*tables, q.copy(), F.copy(), share)
+        return flags
 
     def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)

@@ -329,7 +329,9 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         retreat *= 1.0 - min(T / _FADE_TIME_AT_HAND_REST_S, 1.0)
     memory[_HAND_RETREAT_DISTANCE] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _ZERO_FORCE_RETREAT_DISTANCE_M), 0.0), 1.0)
-    _update_slave_displacement(received, memory)
+    last = memory[_LAST_SLAVE_POSE]
+    pose_difference_into(received[POSE], last, memory[_SLAVE_DISPLACEMENT])
+    copy_into(last, 0, received, POSE.start, 7)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
@@ -337,13 +339,6 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         memory[_WALL_STIFFNESS], memory[_HAND_WALL_DEPTH] = k, depth
         for i in range(6):
             inward[i] = -normal[i]
-
-
-@njit(cache=True)
-def _update_slave_displacement(received, memory):
-    last = memory[_LAST_SLAVE_POSE]
-    pose_difference_into(received[POSE], last, memory[_SLAVE_DISPLACEMENT])
-    copy_into(last, 0, received, POSE.start, 7)
 
 
 @njit(cache=True)
@@ -363,16 +358,12 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
         metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
-        lag = max(
-            cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED),
-            _MIN_FRICTION_RELAXATION_S,
-        )
+        least = _MIN_FRICTION_RELAXATION_S
+        lag = cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
         if g == 1:
-            lag = max(
-                _FRICTION_TORQUE_RELAXATION_S,
-                _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP],
-            )
-        share = T / lag
+            least = _FRICTION_TORQUE_RELAXATION_S
+            lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * received[ROUND_TRIP]
+        share = T / max(lag, least)
         for i in range(3 * g, 3 * g + 3):
             inward = metric * normal[i]
             far[i] -= spring * (slave_step[i] - far_step * inward) + share * far[i]
@@ -452,10 +443,8 @@ def _permitted_braking_share(g, dx, T, p, memory):
 @njit(cache=True)
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[FILTERED_OWN_VELOCITY], 0.0, memory[_IS_DRAG_ACTIVE]
-    speed, own_level = (
-        length_of_group(velocity, g),
-        memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g],
-    )
+    speed = length_of_group(velocity, g)
+    own_level = memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.
     lowest = min(
         own_level, (received[PACKET_LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]

@@ -195,11 +195,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
     filter_velocity(twist, min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0), memory)
-    contact, load, filtered = (
-        memory[_CONTACT_WRENCH],
-        memory[LOAD_WRENCH],
-        memory[_FILTERED_LOAD_WRENCH],
-    )
+    contact, load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH]
+    filtered = memory[_FILTERED_LOAD_WRENCH]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
@@ -245,23 +242,16 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_WRENCH], dx, g))
     new = add_received_energy(g, received, memory)
-    ledger, input_energy, reserve = (
-        memory[STORED_ENERGY],
-        memory[_ENERGY_IN_CONTACT],
-        p[SLAVE_RESERVE][g],
-    )
+    ledger, input_energy = memory[STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
+    reserve = p[SLAVE_RESERVE][g]
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length_of_group(twist, g)
     kinetic = 0.5 * SLAVE_MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _ENERGY_SEND_RATE
-    free, missing, returned = (
-        ledger[g] - kinetic,
-        hold - received[PACKET_LEDGER_LEVEL][g],
-        0.0,
-    )
-    needed = missing
+    free, returned = ledger[g] - kinetic, 0.0
+    needed = missing = hold - received[PACKET_LEDGER_LEVEL][g]
     if in_contact and speed < _SLAVE_REST_SPEED * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
         needed += RESERVE_SHARE_AT_MASTER * reserve
@@ -285,10 +275,8 @@ def _max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
     depth, base = _HAND_PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
     for g in range(2):
-        travel, reserve = (
-            ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth,
-            p[MASTER_RESERVE][g],
-        )
+        travel = ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth
+        reserve = p[MASTER_RESERVE][g]
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[PACKET_LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
         fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
@@ -458,11 +446,8 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
 def _limit_motor_wrench(g, damping, twist, p, memory):
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
-    size, speed, mass = (
-        length_of_group(motor_wrench, g),
-        length_of_group(twist, g),
-        SLAVE_MASS_FACTOR * p[SLAVE_MASS][g],
-    )
+    size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)
+    mass = SLAVE_MASS_FACTOR * p[SLAVE_MASS][g]
     stands = length_of_group(velocity, g) < _SLAVE_STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
     margin, balance = UNUSED_RESERVE_SHARE * p[SLAVE_RESERVE][g], memory[_AVAILABLE_MOTOR_ENERGY][g]
     changed = False
@@ -471,11 +456,9 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     )
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
-        free, k = (
-            _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
-            memory[_CONTACT_STIFFNESS],
-        )
-        spring = (1.0 + memory[_GAIN_MINUS_ONE]) * free * free / (2.0 * max(k, 1.0))
+        free = _WALL_FORCE_WITHOUT_HAND_ENERGY_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g]
+        spring = (1.0 + memory[_GAIN_MINUS_ONE]) * free * free
+        spring /= 2.0 * max(memory[_CONTACT_STIFFNESS], 1.0)
         available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_ENERGY_IN_CONTACT][g])
         if stands or not pushes:
             # Delayed motors gain a little energy at standstill; with an empty balance they yield.

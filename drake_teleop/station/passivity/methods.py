@@ -135,6 +135,7 @@ METHODS = Registry(
         "four_channel": PassivityMethod(four_channel.master_step, four_channel.slave_step),
         "force_limit": PassivityMethod(force_limit.master_step, force_limit.slave_step),
     },
+    PassivityMethod,
 )
 """All methods by name."""
 

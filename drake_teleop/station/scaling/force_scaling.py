@@ -96,8 +96,15 @@ class ForceScalingConfig:
     def scales(self, where: str = "force_scaling") -> Scales:
         """Return the scales of gripper, object and contact.
 
-        A DrakeTeleopError is raised if eta is combined with other scales, or gripper_phi is None.
+        A DrakeTeleopError is raised if eta is combined with other scales, or gripper_phi is None,
+        or has a negative mass.
         """
+        if self.gripper_phi is not None and self.gripper_phi[0] < 0.0:
+            raise DrakeTeleopError(
+                f"a mass of {self.gripper_phi[0]:g} kg is negative",
+                where=f"{where}.gripper_phi",
+                remedy="give phi as of `identify`: [m, m cx, m cy, m cz, Ixx, ...]",
+            )
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
             weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)

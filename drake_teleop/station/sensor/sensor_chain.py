@@ -76,6 +76,7 @@ class WristSensorConfig:
             "choices": ("custom", *PRESET_NAMES),
             "doc": "in a file: whose figures the fields have that the file leaves out; custom: the "
             'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
+            "in_python": "set wrist_sensor = drake_teleop.station.sensor.presets.PRESETS[name]",
         },
     )
     ideal: bool = plain(False, "true values at the sampling instant, at So in S, without all parts")
@@ -85,7 +86,7 @@ class WristSensorConfig:
     misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
     acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
-    unit: int = plain(0, "seed of the calibration errors within their bounds")
+    unit: int = quantity(0, "1", 0, 2**32 - 1, "seed of the calibration errors within their bounds")
 
     p_SoAo_S: list[float] = quantity([0.0, 0.0, 0.0175], "m", -1.0, 1.0, "accelerometer position")
     R_SA: list[float] = quantity(

@@ -7,7 +7,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.config import choice, quantity, settings
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -40,7 +40,9 @@ class JointControlConfig:
         "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
         " position for the fields of `interface`",
     )
-    interface: PositionInterface | None = None
+    interface: PositionInterface | None = plain(
+        None, "values in place of those of the servo; null: the servo's"
+    )
 
     @property
     def position_interface(self) -> PositionInterface | None:
@@ -72,6 +74,16 @@ class JointControlConfig:
         interface = self.position_interface
         if interface is not None:
             interface.check(f"{where}.interface", rate)
+            return
+        for name in ("position_bandwidth_hz", "velocity_bandwidth_hz"):
+            # A double integrator with held torques is stable below gain 2 / period in both loops.
+            if (bandwidth := getattr(self, name)) >= rate / np.pi:
+                raise DrakeTeleopError(
+                    f"{bandwidth:g} Hz is unstable with joint control at {rate:g} Hz (stable below"
+                    f" {rate / np.pi:.4g} Hz)",
+                    where=f"{where}.{name}",
+                    remedy="lower it, or raise rates.joint_control_hz",
+                )
 
     def check_computed_torque(self, what: str) -> None:
         """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""

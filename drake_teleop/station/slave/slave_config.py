@@ -12,6 +12,7 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, IK_METHODS
+from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 
 
@@ -69,7 +70,7 @@ class Slave:
         metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
     tip: list[float] = quantity(
-        [], "m", -10.0, 10.0, "p_STip; default: the frame `tip` or the end of the shapes along z_S"
+        [], "m", -2.0, 2.0, "p_STip; default: the frame `tip` or the end of the shapes along z_S"
     )
 
     @property
@@ -85,8 +86,10 @@ class Slave:
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def model_files(self) -> list[Path]:
+        """Return the existing files of arm and tool, with those that they include."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
-        return [path for path in paths if path.is_file()]
+        folders = self.package_folders
+        return [file for path in paths for file in list_model_files(path, folders)]
 
     def check(self, where: str) -> None:
         if len(self.tip) not in (0, 3):

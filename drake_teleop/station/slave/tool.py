@@ -83,8 +83,8 @@ class Tool:
         if self.model and self.mass:
             what = "a model file and a mass both define the tool"
             raise DrakeTeleopError(what, where=f"{where}.mass", remedy="leave one of them out")
-        if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            what = "shapes and inertia require a mass"
+        if self.mass == 0.0 and (self.shapes or any(self.inertia) or self.com != Tool().com):
+            what = "shapes, inertia and com require a mass"
             remedy = "give the mass, or remove them"
             raise DrakeTeleopError(what, where=f"{where}.mass", remedy=remedy)
         if not _tool_spatial_inertia(self).IsPhysicallyValid():

@@ -50,6 +50,13 @@ class ModelFiles:
         self._total = 0, 0
         _check_num_files_and_size(1, model.stat().st_size, model)
         self.packages: dict[str, Path] = {}
+        for folder in package_paths:
+            if not folder.is_dir():
+                raise DrakeTeleopError(
+                    f"there is no folder {folder} for its packages",
+                    where=str(model),
+                    remedy="correct slave.package_paths or --package-path",
+                )
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
             if folder.is_dir():
@@ -66,7 +73,7 @@ class ModelFiles:
                     self.packages.setdefault(name, folder)
         own += filter(_is_installed_python_package, around)
         self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
-        self._sizes: dict[Path, tuple[int, int]] = {}
+        self.sizes: dict[Path, tuple[int, int]] = {}  # number and bytes of files, by file
         self._bases = {""}
 
     def add_packages_to_map(self, known: PackageMap) -> None:
@@ -118,7 +125,7 @@ class ModelFiles:
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
-            self._sizes.clear()
+            self.sizes.clear()
             files, size = self._count_with_references(path, ())
         self._total = self._total[0] + files, self._total[1] + size
         _check_num_files_and_size(*self._total, self._model)
@@ -134,7 +141,7 @@ class ModelFiles:
             raise DrakeTeleopError(
                 f"{what} through {path.name}", where=where, remedy="remove this reference"
             )
-        if real not in self._sizes:
+        if real not in self.sizes:
             if not (real.is_file() or real.is_dir()):
                 what = f"references {path}, which does not exist"
                 raise DrakeTeleopError(what, where=where, remedy="correct the path or add the file")
@@ -144,8 +151,8 @@ class ModelFiles:
                 more = self._count_with_references(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_num_files_and_size(files, size, path)
-            self._sizes[real] = files, size
-        return self._sizes[real]
+            self.sizes[real] = files, size
+        return self.sizes[real]
 
     def _referenced_files(self, path: Path) -> Iterator[Path]:
         tops = [path.parent, self._folder]
@@ -188,6 +195,18 @@ class ModelFiles:
             ).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
+
+
+def list_model_files(model: Path, package_paths: tuple[Path, ...]) -> list[Path]:
+    """Return the model file and the files that it includes; none if it does not exist."""
+    if not os.path.isfile(model):
+        return []
+    try:
+        files = ModelFiles(model, package_paths)
+        files.check_referenced_files(model)
+    except (DrakeTeleopError, OSError):  # the parser raises it again
+        return [model]
+    return sorted(path for path in files.sizes if path.is_file())
 
 
 def _is_installed_python_package(folder: Path) -> bool:
