@@ -15,13 +15,14 @@ pytestmark = pytest.mark.checks
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_teleop"
-FOLDERS = ("tests", "benchmarks", "docs", "docs/_ext", "docs/gallery")
+FOLDERS = ("tests", "tests/*", "benchmarks", "docs", "docs/_ext", "docs/gallery")
 FILES = sorted(
-    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in (ROOT / each).glob("*.py"))]
+    [*PACKAGE.rglob("*.py"), *(path for each in FOLDERS for path in ROOT.glob(f"{each}/*.py"))]
 )
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
-    *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But"),
+    *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But", "Against", "In"),
+    *("Along", "Within", "Over", "Beyond", "After", "Then", "Among", "Neither", "There", "Its"),
 }
 """A docstring begins with a verb or a noun phrase; exceptions: "Whether" of
 properties, and questions of benchmarks."""

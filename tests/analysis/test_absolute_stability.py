@@ -57,8 +57,8 @@ def test_llewellyn_agrees_with_search_over_lossless_loads():
     rng = np.random.default_rng(2)
     for h, is_stable in zip(H[:200], stable[:200], strict=True):
         z_e = 1j * np.tan(rng.uniform(-np.pi / 2, np.pi / 2, 20000)) * np.exp(rng.normal())
-        felt = tp.transmitted_impedance(h, z_e).real
-        assert not (is_stable and felt.min() < 0)
+        displayed = tp.transmitted_impedance(h, z_e).real
+        assert not (is_stable and displayed.min() < 0)
 
 
 def test_passive_implies_absolutely_stable_but_not_the_reverse():
@@ -106,8 +106,8 @@ def test_position_force_is_not_absolutely_stable_even_without_delay():
     # 890 is the value at 10^4 rad/s; it grows without limit, k_f m_s w / 2.
     assert np.argmax(needed) == len(omega) - 1
     for w in (1e5, 1e6):
-        last = ab.required_damping(pd_station(np.array([w]), axis))[0]
-        assert last == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
+        damping = ab.required_damping(pd_station(np.array([w]), axis))[0]
+        assert damping == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
     # It is the damping at which no lossless load gives a negative resistance.
     some = slice(1000, None, 100)
     less = tp.absorb_impedances(H, hand=0.999 * needed)
@@ -213,7 +213,7 @@ def first_crossing(mass, damping, stiffness, contact):
     return np.where(np.isnan(trip), np.inf, trip)
 
 
-def last(holds, high):
+def largest_valid(holds, high):
     """Return the limit up to which `holds`, by bisection from 0."""
     low = 0.0
     while high - low > 1e-3 * high:
@@ -241,7 +241,7 @@ def test_disc_criterion_is_conservative_by_the_known_factor():
         def small(stiffness, H=H):
             return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
 
-        largest, sufficient = np.min(ab.stiffness_limit(H, omega, hand)), last(small, 1e4)
+        largest, sufficient = np.min(ab.stiffness_limit(H, omega, hand)), largest_valid(small, 1e4)
         assert largest == pytest.approx(exact, rel=0.02)
         assert 0.9 * largest < sufficient < largest
 

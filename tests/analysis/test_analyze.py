@@ -58,7 +58,7 @@ def test_diagram_equals_sampled_model_of_one_axis(run):
 
 @pytest.mark.slow
 def test_slowest_motion_agrees_with_one_axis(run):
-    """It is the vertical motion, which the wrist's coupling changes by 1 %."""
+    """The slowest motion is vertical, and the wrist's coupling changes it by 1 %."""
     for point in run[0]["diagram"]:
         for name in ("decay_1_per_s", "frequency_Hz"):
             assert point[name] == pytest.approx(point["one_axis"][name], rel=0.02)

@@ -29,7 +29,7 @@ UP = (0.0, 0.0, 1.0)
 #: Here a vertical force on the stylus moves the inner link alone.
 DECOUPLED = [0.215, 0.0, -0.17]
 OMEGA = 2 * np.pi * np.geomspace(1.0, 30.0, 25)
-#: A servo that is where it is told to be after two periods, and rests there.
+#: A servo that reaches its command after two periods and rests there.
 DEADBEAT = {
     "joint_control__position_bandwidth_hz": 1 / (1.5 * PERIOD) / (2 * np.pi),
     "joint_control__velocity_bandwidth_hz": 1.5 / PERIOD / (2 * np.pi),
@@ -85,7 +85,7 @@ def stale_weight(scenario: Scenario, direction):
 def exact_two_port(scenario: Scenario, omega):
     """Return H of one axis with ideal sensor, delayed weight and a tool that a force rotates.
 
-    The slave's motion is that of the command plus that of the push; the sensor feels the tool's
+    The slave's motion is that of command and push; the sensor measures the tool's
     mass times the acceleration of its centre, 125 us before the end of each period.
     """
     task = task_direction(scenario, UP)
@@ -94,7 +94,7 @@ def exact_two_port(scenario: Scenario, omega):
     mass = axis.device_mass + axis.hand_mass
     decay = np.exp(-axis.device_damping * T / mass)
     glide = mass / axis.device_damping * (1 - decay)
-    # x_m, v_m; x, v of So and of the tool's centre, by the command, and by the push; felt force |
+    # x_m, v_m; x, v of So and of the tool's centre, by the command, and by the push; sensor force |
     # hand's force, push. The servo pulls back each in its own direction.
     A = np.zeros((11, 13))
     A[0, :2], A[1, 1] = (1, glide), decay
@@ -166,10 +166,9 @@ def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
-    """Half a period in the servo's loop; a period and the low-pass's delay on the force's way.
+    """The servo's loop has half a period more delay, the force a period and the low-pass's.
 
-    An input of the model that is held acts on the sensor 1.5 of its samples sooner than a smooth
-    one would.
+    A held input of the model acts on the sensor 1.5 samples earlier than a smooth one.
     """
     scenario = replace(LoadScenario("free_motion_force"), force_scaling__sigma=sigma)
     task = task_direction(scenario, UP)
@@ -212,7 +211,7 @@ def test_sideways_force_rotates_the_tool():
 @pytest.mark.long
 @pytest.mark.slow
 def test_sideways_tip_compliance_includes_the_hands_wrist():
-    """A force at the tip is a torque at the hand; the tool turns: 130 times softer."""
+    """A force at the tip is a torque at the hand, which rotates the tool: 130 times softer."""
     scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     system = wired(linearize(scenario, load_estimate=true_load(scenario)))

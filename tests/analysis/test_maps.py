@@ -25,7 +25,7 @@ LIGHT = replace(
 )
 FREE = {"wall_stiffness": 0.0, "wall_damping": 0.0}
 SLOW_HAND = Sampling(hand_hz=500.0, low_pass_hz=500.0)
-WHOLE = np.arange(0, 120, 4) * 2e-3  # whole periods of any hand here, one way [s]
+WHOLE = np.arange(0, 120, 4) * 2e-3  # whole periods of any hand here, in one direction [s]
 
 MAPS = {
     "delay and stiffness": (
@@ -87,7 +87,7 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
-    """Along the parameter other than delay, at whole periods of delay."""
+    """The parameter other than delay varies by 1 %, at whole periods of delay."""
     axis, sampling, found = drawn
     x, y = found.boundary.T
     moved, fixed = (found.y_name, found.x) if found.x_name != "sigma" else (found.x_name, found.y)
@@ -112,7 +112,7 @@ def test_displayed_tool_causes_windows_of_instability_in_free_motion(
     """Light grip, ideal servo: m s^2 + b s + k + mu s^2 e^(-s RTT) = 0."""
     m, b, k = LIGHT.hand_mass + LIGHT.device_mass, LIGHT.hand_damping, LIGHT.hand_stiffness
     b, mu = b + LIGHT.device_damping, LIGHT.force_scale * LIGHT.tool_mass
-    # |k - m w^2 + j b w| = mu w^2; the delays follow from the phase, with whole turns.
+    # |k - m w^2 + j b w| = mu w^2; the delays follow from the phase, with whole rotations.
     w = np.sqrt(np.roots([m**2 - mu**2, b**2 - 2 * k * m, k**2]).real)
     phase = np.angle(mu * w**2 / (k - m * w**2 + 1j * b * w))
     windows = np.sort(1e3 * (phase + 2 * np.pi * np.array([[1], [2]])) / w)

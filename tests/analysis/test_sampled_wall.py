@@ -92,7 +92,7 @@ def test_stable_stiffness_is_above_the_passive_one():
 
 @pytest.mark.parametrize("B", [0.0, -0.5])
 def test_the_worst_hand_comes_close_to_the_passive_limit(B):
-    """Among undamped hands of mass and spring."""
+    """The hands are undamped masses with springs."""
     mass, hand = np.geomspace(1e-3, 50, 20)[:, None], np.r_[0.0, np.geomspace(1, 1e5, 15)]
     stable = stable_stiffness(mass, 2.0, B, PERIOD, hand_stiffness=hand)
     worst = np.min(stable) / passive_stiffness(2.0, B, PERIOD)

@@ -62,7 +62,7 @@ def test_wall_stiffness_and_description_of_environments(things, stiffness, what)
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])
 def test_free_slave_is_lighter_than_a_guided_one(direction):
-    """Along the tool a force causes little rotation."""
+    """A force along the tool causes little rotation."""
     task = task_direction(LoadScenario("free_motion_force"), direction)
     assert np.linalg.norm(task.tool[:3]) == pytest.approx(1.0)
     assert np.linalg.norm(task.tool[3:]) <= 0.2 + 1e-12

@@ -278,7 +278,7 @@ def ports(block, kind) -> str:
     return ", ".join(f"`{get(k).get_name()}` {get(k).size()}" for k in range(count))
 
 
-def test_the_table_of_blocks_is_that_of_the_real_ports():
+def test_table_of_blocks_equals_the_actual_ports():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
     found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:6]] for row in rows}
     assert {*found} == {*EXAMPLES}
@@ -295,7 +295,7 @@ def test_the_table_of_blocks_is_that_of_the_real_ports():
 
 
 @pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in GENERIC])
-def test_a_conversion_that_is_impossible_is_one_line(name):
+def test_impossible_conversion_raises_one_line(name):
     block = EXAMPLES[name]()
     for convert in (block.ToAutoDiffXd, block.ToSymbolic):
         with pytest.raises(DrakeTeleopError, match=rf"^{name}: .* for double only; .*$"):
@@ -303,7 +303,7 @@ def test_a_conversion_that_is_impossible_is_one_line(name):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_two_ends_and_two_networks_equal_the_channel_of_the_station(method):
+def test_ends_and_networks_equal_the_channel_of_the_station(method):
     line = NetworkConfig(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1)
     passivity, scales = PassivityConfig(method=method), np.array([2.0, 1.0])
     if method == "ledger":
@@ -431,7 +431,7 @@ def test_a_block_works_beside_a_plant(name, time_step):
     elif name == "WrenchScaling":
         np.testing.assert_allclose(found["contact_wrench_S"], 0.0, atol=1e-9)
     elif name == "LoadEstimator":
-        assert np.abs(found["load_estimate"]).max() > 0.1  # it has learnt
+        assert np.abs(found["load_estimate"]).max() > 0.1  # load after these samples
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -453,7 +453,7 @@ def test_a_script_sets_and_reads_state_parameters_and_inputs(name):
         port = block.get_input_port(k)
         port.FixValue(context, 0.1 * np.arange(port.size()))
         np.testing.assert_array_equal(port.Eval(context), 0.1 * np.arange(port.size()))
-    assert vectors or name == "WrenchScaling"  # whose only settings are those of its constructor
+    assert vectors or name == "WrenchScaling"  # all settings are in the constructor
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

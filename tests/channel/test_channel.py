@@ -45,8 +45,8 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
 
 
-def test_ledger_knows_the_encoder_steps_of_the_device():
-    """omega_6: 0.01 mm, 0.09 deg; geomagic_touch: 0.055 mm; an own value stays."""
+def test_ledger_has_the_encoder_steps_of_the_device():
+    """Steps: omega_6 0.01 mm and 0.09 deg, geomagic_touch 0.055 mm; a given value is kept."""
     scenario = Scenario()
     steps = {}
     for model in ("phantom_premium_15", "omega_6", "geomagic_touch"):
@@ -60,7 +60,7 @@ def test_ledger_knows_the_encoder_steps_of_the_device():
 
 
 def moving(**changes: object) -> Scenario:
-    """The hand swings up and down and turns a little, from 0.6 s on."""
+    """Return a hand that swings up and down and rotates a little, from 0.6 s on."""
     sine = Sine(
         t_start=0.6,
         duration=10.0,
@@ -86,32 +86,32 @@ def run(scenario: Scenario, load_estimate: np.ndarray):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 40])
-def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate):
-    """At 2 kHz, logged at 2 kHz: outputs are delayed inputs, to rounding."""
+def test_channel_without_method_delays_both_directions(steps, load_estimate):
+    """Outputs are delayed inputs up to rounding; samples and log are at 2 kHz."""
     result = run(moving(channel__delay=steps / 2000), load_estimate)
     np.testing.assert_allclose(
         result["pose_received"][steps:], result["pose_command"][:-steps], atol=1e-12
     )
-    # What the hand should feel is -F' / 17.5, turned into B.
-    felt = np.linalg.norm(result["scaled_wrench_S"][:, :3], axis=1) / 17.5
+    # The expected force at the hand is -F' / 17.5, rotated into B.
+    rendered_force = np.linalg.norm(result["scaled_wrench_S"][:, :3], axis=1) / 17.5
     shown = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
-    np.testing.assert_allclose(shown[steps:], felt[:-steps], atol=1e-9)
-    assert felt.max() > 0.1
+    np.testing.assert_allclose(shown[steps:], rendered_force[:-steps], atol=1e-9)
+    assert rendered_force.max() > 0.1
 
 
 @pytest.mark.parametrize("channel", [Channel(), Channel(network="ideal")])
-def test_an_ideal_network_without_a_method_is_wires(channel):
+def test_ideal_network_without_method_changes_no_signal(channel):
     side = MakeChannel(moving(channel=channel))
     assert [type(block) for block in side.GetSystems()] == [PassThrough, PassThrough]
     assert not side.HasInputPort("hand_wrench_E") and not side.HasOutputPort("ports")
 
 
-def test_the_ports_count_the_work_of_the_hand(load_estimate):
-    """Against the same sum over the logged force and motion of the stylus itself."""
+def test_ports_contain_the_work_of_the_hand(load_estimate):
+    """Compare with the sum over the logged force and motion of the stylus."""
     result = run(moving(channel__delay=0.01), load_estimate)
     force, twist = result["force_to_master"], result["pose_command"][:, 4:]
     work = np.cumsum(np.sum(force[:-1, :3] * np.diff(twist, axis=0), axis=1))
-    # What the block has counted at an instant of the log ends a step before.
+    # The sums of the block in a row of the log end one step earlier.
     counted = -(result["ports"][:, 0] - result["ports"][1, 0])
     np.testing.assert_allclose(counted[2:], work[:-1], atol=1e-12)
     assert np.abs(work).max() > 1e-4
@@ -119,7 +119,7 @@ def test_the_ports_count_the_work_of_the_hand(load_estimate):
 
 @pytest.mark.long
 def test_load_wrench_is_transformed_as_the_wrench():
-    """With a rotated base and unequal scales."""
+    """The base is rotated and the scales are unequal."""
     scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])
     scenario = moving(kinematic_scaling=scaling, passivity=PassivityConfig(method="ledger"))
     side, wrench = MakeChannel(scenario), np.arange(1.0, 7.0)
@@ -151,7 +151,7 @@ def test_packets_in_transit_belong_to_the_context():
         for _ in range(number):
             context.SetDiscreteState(block.EvalUniquePeriodicDiscreteUpdate(context))
 
-    def felt(context: Context) -> np.ndarray:
+    def rendered_force(context: Context) -> np.ndarray:
         return block.GetOutputPort("wrench_received").Eval(context)
 
     one, alone = block.CreateDefaultContext(), block.CreateDefaultContext()
@@ -162,8 +162,8 @@ def test_packets_in_transit_belong_to_the_context():
         steps(other, 1, 0.3)
     steps(alone, 800, 1.0)
     steps(alone, 40, 0.3)
-    assert felt(one)[0] > 1.2 * felt(alone)[0] > 0.0
-    np.testing.assert_array_equal(felt(other), felt(alone))
+    assert rendered_force(one)[0] > 1.2 * rendered_force(alone)[0] > 0.0
+    np.testing.assert_array_equal(rendered_force(other), rendered_force(alone))
 
 
 def test_directions_may_differ():
@@ -190,10 +190,10 @@ def test_invalid_channel_is_rejected(changes, message, load_estimate):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
+def test_temporary_failure_of_the_wrist_sensor_stops_the_station_smoothly(
     monkeypatch, load_estimate
 ):
-    """From 0.2 to 0.4 s its wrench is NaN; the hand moves all the time."""
+    """The wrench is NaN from 0.2 to 0.4 s while the hand moves."""
     scenario = moving(
         channel__delay=0.01,
         simulation__duration=1.2,
@@ -209,14 +209,14 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     monkeypatch.setattr(channel, "step_channel", failing)
     result = run(scenario, load_estimate)
     for name in result:
-        values = result[name][:, :4] if name == "ports" else result[name]  # then come ages
+        values = result[name][:, :4] if name == "ports" else result[name]  # then the ages
         assert np.isfinite(values).all(), name
     t, force = result.t, np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     position = result["pose_received"][:, 4:]
     safe = (t > 0.2 + 0.01 + STOP_TIME_S + 0.005) & (t < 0.4)
     assert force[safe].max() < 1e-12
     assert np.ptp(position[safe], axis=0).max() < 1e-12
-    # Later the hand feels the tool's inertia at full, which trembles without the failure as well.
+    # Later the hand receives the full inertia of the tool, which vibrates also without the failure.
     resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME_S
     assert np.abs(np.diff(result["force_to_master"][:, :3], axis=0))[resumed].max() < 0.5
     fastest = np.abs(np.diff(sound["pose_received"][:, 4:], axis=0)).max()

@@ -1,4 +1,4 @@
-"""Data that are not finite, and a saturated sensor, at either end: smooth, bounded, temporary."""
+"""Values that are not finite, and a saturated sensor, at either end."""
 
 from __future__ import annotations
 
@@ -33,22 +33,19 @@ FAULTS = ("hand_pose", "hand_wrench", "slave_pose", "slave_wrench", "saturated")
 
 @dataclass
 class Run:
-    """Arrays over the steps; x along the axis of motion, ports (N, 8).
-
-    What is felt: the wrench (6) and the flag of contact.
-    """
+    """Signals of all steps: x along the motion, wrench and contact flag `felt`, ports (N, 8)."""
 
     t: np.ndarray
     hand: np.ndarray
     command: np.ndarray
     felt: np.ndarray
     ports: np.ndarray
-    servo: np.ndarray  # what its servo pulls with, and what the method at its port believes
+    servo: np.ndarray  # force of its servo, and the servo force assumed by the method at its port
     touched: np.ndarray  # by the wall, at the slave
 
 
 def hand_position() -> np.ndarray:
-    """Along x [m]: from free space into the wall at 0, 5 mm deep, and from 2.5 s on out again."""
+    """Return x [m]: into the wall at 0, 5 mm deep, and out again from 2.5 s on."""
     t = np.arange(STEPS) * T
     u = np.clip(np.stack([t - 0.3, t - 2.5]) / 0.5, 0.0, 1.0)
     ramp = u**3 * (10.0 + u * (6.0 * u - 15.0))
@@ -56,7 +53,7 @@ def hand_position() -> np.ndarray:
 
 
 def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=np.nan) -> Run:
-    """Both ends with a hand that moves as prescribed and a slave behind a servo."""
+    """Simulate both ends with a prescribed motion of the hand and a slave behind a servo."""
     p = method_parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
     line = NetworkConfig(delay=DELAY)
     lines = [network.network_parameters(line, 0, way, T, least=1) for way in range(2)]
@@ -98,7 +95,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
-def test_the_flag_of_contact_travels_with_the_packets(method):
+def test_packets_contain_the_contact_flag(method):
     found = run(method, None)
     touched, told = found.touched, found.felt[:, 6]
     late = round(DELAY / T)
@@ -110,7 +107,7 @@ def test_the_flag_of_contact_travels_with_the_packets(method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
+def test_signals_are_smooth_and_bounded_and_recover_after_a_fault(method, fault):
     sound, faulty = run(method, None), run(method, fault, bad=np.inf)
     t, x, f = faulty.t, faulty.command[:, 4], faulty.felt[:, 0]
     assert np.isfinite(faulty.command).all() and np.isfinite(faulty.felt).all()
@@ -118,7 +115,7 @@ def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
     assert np.linalg.norm(faulty.felt[:, :3], axis=1).max() <= LIMIT + 1e-12
     before = (t > 0.9) & (t < FAULT[0])
     assert np.abs(f[before]).max() > 0.1, "nothing was felt that could fade"
-    # No step, of force or of the command, that the sound run does not have.
+    # Neither force nor command has a step that the run without fault does not have.
     assert np.abs(np.diff(f)).max() < 0.5
     missed = np.ptp(faulty.hand[(t > FAULT[0]) & (t < FAULT[1])])
     fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME_TIME_S
@@ -128,7 +125,7 @@ def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
     if fault != "saturated":
         assert np.abs(f[safe]).max() < 1e-12
         assert np.ptp(x[safe]) < 1e-12
-    # In free motion it is as if nothing had been.
+    # Free motion is as without the fault.
     after = t > 3.5
     assert np.abs(x - sound.command[:, 4])[after].max() < 1e-3
     assert np.abs(f - sound.felt[:, 0])[after].max() < 0.1
@@ -142,7 +139,7 @@ def test_one_bad_sample_has_little_effect(method, fault):
     assert np.abs(np.diff(faulty.felt[:, 0])).max() < 0.5
 
 
-def test_the_hand_fades_in_50_ms_and_not_at_once():
+def test_force_at_the_hand_fades_over_50_ms():
     """The pose of the hand is valid; the slave's wrench is missing."""
     found = run("none", "slave_wrench")
     f = found.felt[:, 0]
@@ -167,7 +164,7 @@ def test_last_valid_wrench_is_rendered_while_the_sensor_is_saturated():
 
 @pytest.mark.parametrize("method", ["two_layer", "pspm"])
 def test_motor_ledger_uses_the_command_after_the_safe_state(method):
-    """In the safe state and while it ends, this differs from the method's command."""
+    """The command in the safe state and at its end differs from that of the method."""
     found = run(method, "hand_wrench")
     t = found.t
     changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME_S)

@@ -1,4 +1,4 @@
-"""Network: the newest packet, the packet that is read, and their statistics."""
+"""Newest packet, received packet, and their statistics."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def networks(draw) -> NetworkConfig:
 seeds = st.integers(0, 2**63 - 1)
 
 
-# Not cached: numba would not see that the functions which it calls have changed.
+# Not cached: numba does not detect changes of called functions.
 @njit
 def _exchange(p, state, packets, received, newest, fresh):
     for k in range(len(packets)):
@@ -82,7 +82,7 @@ def _exchange(p, state, packets, received, newest, fresh):
 
 
 def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):
-    """The step form over all packets: what is received, the newest step, whether it is new."""
+    """Return received packets, newest steps and whether they are new, from the step form."""
     p = network_parameters(config, seed, FORWARD, PERIOD)
     neutral = np.zeros(packets.shape[1]) if neutral is None else neutral
     received, newest = np.empty_like(packets), np.empty(len(packets), int)
@@ -97,20 +97,20 @@ def random_packets(steps: int = STEPS, seed: int = 0) -> np.ndarray:
     return packets
 
 
-def oracle(config: NetworkConfig, seed: int) -> np.ndarray:
-    """The newest packet from the definition: of all that have arrived, the one sent last."""
+def newest_by_definition(config: NetworkConfig, seed: int) -> np.ndarray:
+    """Return the newest packet by its definition: of all that have arrived, the one sent last."""
     playout = round(config.playout / PERIOD)
     arrivals = []
     for sent, copies in enumerate(packet_delays(config, seed, FORWARD, STEPS, PERIOD).tolist()):
         least = 0 if config.redundant else playout
         arrivals += [(sent + max(travel, least), sent) for travel in copies if travel >= 0]
     newest = [max((j for at, j in arrivals if at <= k), default=-1) for k in range(STEPS)]
-    if config.redundant:  # every sample up to the newest is there, and played at its time
+    if config.redundant:  # every sample up to the newest has arrived and is played at its time
         newest = [min(j, max(k - playout, -1)) for k, j in enumerate(newest)]
     return np.array(newest)
 
 
-# Which packet is the newest.
+# Newest packet
 
 
 @pytest.mark.slow
@@ -123,11 +123,11 @@ def test_step_form_equals_the_vectorised_form(config, seed):
     packets = random_packets()
     received, newest, fresh = exchange(config, packets, seed)
     np.testing.assert_array_equal(newest, newest_packets(config, seed, FORWARD, STEPS, PERIOD))
-    # What is read is the packet itself, whatever was lost, late or doubled.
+    # The received packet is the newest one, for any loss, delay or duplication.
     some = newest >= 0
     np.testing.assert_array_equal(received[some], packets[newest[some]])
     assert not received[~some].any()
-    # It never goes back, never comes from the future, and is new just when it changes.
+    # The index never decreases, is never in the future, and is new only when it changes.
     assert (np.diff(newest, prepend=-1) >= 0).all()
     assert (newest <= np.arange(STEPS)).all()
     np.testing.assert_array_equal(fresh, np.diff(newest, prepend=-1) > 0)
@@ -139,9 +139,9 @@ def test_step_form_equals_the_vectorised_form(config, seed):
 @example(replace(ROUGH, playout=0.05), 1)
 @example(replace(ROUGH, playout=0.05, redundant=True, rate_hz=300.0), 2)
 @example(replace(ROUGH, delay=0.1, playout=0.05, redundant=True), 3)
-def test_the_newest_is_the_last_sent_of_those_that_arrived(config, seed):
+def test_newest_packet_is_the_last_sent_of_all_arrivals(config, seed):
     np.testing.assert_array_equal(
-        newest_packets(config, seed, FORWARD, STEPS, PERIOD), oracle(config, seed)
+        newest_packets(config, seed, FORWARD, STEPS, PERIOD), newest_by_definition(config, seed)
     )
 
 
@@ -160,7 +160,7 @@ def test_a_constant_delay_is_a_shift(steps):
 
 
 @given(networks(), seeds)
-def test_duplicates_only_ever_bring_a_packet_sooner(config, seed):
+def test_duplicates_only_reduce_the_delay(config, seed):
     once = newest_packets(replace(config, duplicate=0.0), seed, FORWARD, STEPS, PERIOD)
     twice = newest_packets(replace(config, duplicate=1.0), seed, FORWARD, STEPS, PERIOD)
     assert (twice >= once).all()
@@ -198,16 +198,16 @@ def test_a_playout_buffer_above_the_greatest_age_is_a_constant_delay(config, see
     oldest = int(age.max())
     packets = random_packets()
 
-    def over(config: NetworkConfig) -> bytes:
+    def received_bytes(config: NetworkConfig) -> bytes:
         return exchange(config, packets, seed)[0].tobytes()
 
     buffered = replace(config, playout=oldest * PERIOD, redundant=True)
-    assert over(buffered) == over(NetworkConfig(delay=oldest * PERIOD))
-    # One step less, and some sample comes too late: the bound is sharp.
+    assert received_bytes(buffered) == received_bytes(NetworkConfig(delay=oldest * PERIOD))
+    # With one step less, some sample arrives too late: the bound is sharp.
     if oldest > 0:
         sooner = (oldest - 1) * PERIOD
         late = replace(config, playout=sooner, redundant=True)
-        assert over(late) != over(NetworkConfig(delay=sooner))
+        assert received_bytes(late) != received_bytes(NetworkConfig(delay=sooner))
 
 
 @given(networks(), seeds)
@@ -219,37 +219,36 @@ def test_without_loss_the_playout_buffer_needs_no_redundancy(config, seed):
     np.testing.assert_array_equal(newest, constant)
 
 
-def test_the_seed_and_the_direction_decide():
+def test_packets_depend_on_seed_and_direction():
     first = newest_packets(ROUGH, 7, FORWARD, STEPS, PERIOD)
     np.testing.assert_array_equal(first, newest_packets(ROUGH, 7, FORWARD, STEPS, PERIOD))
     assert (first != newest_packets(ROUGH, 8, FORWARD, STEPS, PERIOD)).mean() > 0.5
     assert (first != newest_packets(ROUGH, 7, BACKWARD, STEPS, PERIOD)).mean() > 0.5
 
 
-def test_a_longer_run_begins_as_a_shorter_one():
+def test_longer_run_has_the_packets_of_a_shorter_one():
     np.testing.assert_array_equal(
         newest_packets(ROUGH, 3, FORWARD, 10 * STEPS, PERIOD)[:STEPS],
         newest_packets(ROUGH, 3, FORWARD, STEPS, PERIOD),
     )
 
 
-def test_if_all_is_lost_nothing_is_received():
+def test_no_packet_is_received_if_all_are_lost():
     packets, neutral = random_packets(), np.arange(float(PACKET_SIZE))
     received, newest, fresh = exchange(NetworkConfig(loss=1.0, burst=0.1), packets, 0, neutral)
     assert (newest == -1).all() and not fresh.any()
     np.testing.assert_array_equal(received, np.tile(neutral, (STEPS, 1)))
 
 
-# Statistics. Tolerances are five standard deviations of the estimate, which the seed, fixed, passes
-# or fails for ever.
+# Statistics. Tolerances are five standard deviations of the estimate; the seed is fixed.
 
 MANY = 200_000
 
 
 @pytest.mark.parametrize("jitter", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
-def test_mean_spread_and_floor_of_the_delay(distribution, jitter):
-    mean = 500  # steps, so that rounding to whole steps adds nothing
+def test_delay_has_the_configured_mean_spread_and_floor(distribution, jitter):
+    mean = 500  # steps, to avoid rounding to whole steps
     config = NetworkConfig(delay=mean * PERIOD, jitter=jitter, distribution=distribution)
     delays = packet_delays(config, 1, FORWARD, MANY, PERIOD)[:, 0]
     std = jitter * mean / math.sqrt(3)
@@ -284,7 +283,7 @@ def test_delays_are_independent_of_each_other():
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
 def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
-    """A packet has sixteen numbers, each for one purpose."""
+    """Each of the sixteen numbers of a packet has one purpose."""
     config = NetworkConfig(
         delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
     )
@@ -292,7 +291,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
 
     def uniform(p, k, draw):
         taken.append((k, draw))
-        return 0.6  # nothing is lost, all comes twice
+        return 0.6  # no packet is lost, and each is duplicated
 
     monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
@@ -301,19 +300,19 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]
-    # The chain's, the duplicate's, and both delays'.
+    # Those of the chain, of the duplicate, and of both delays.
     assert len(taken) == len(set(taken)) == 20 * (2 + 2 * each)
 
 
 def runs_of(lost: np.ndarray) -> np.ndarray:
-    """The lengths of the runs of losses that begin and end inside."""
+    """Return the lengths of the runs of losses that begin and end inside."""
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     return np.diff(edges)[int(lost[0]) :: 2] if edges.size else edges
 
 
 @pytest.mark.parametrize("burst", [0.0, 1e-3, 0.02])
 @pytest.mark.parametrize("loss", [0.01, 0.3, 0.9])
-def test_loss_and_mean_length_of_its_bursts(loss, burst):
+def test_loss_and_mean_burst_length_are_as_configured(loss, burst):
     config = NetworkConfig(loss=loss, burst=burst)
     lost = packet_delays(config, 4, FORWARD, MANY, PERIOD)[:, 0] < 0
     memory = math.exp(-PERIOD / (burst * (1 - loss))) if burst else 0.0
@@ -323,17 +322,17 @@ def test_loss_and_mean_length_of_its_bursts(loss, burst):
     runs, leave = runs_of(lost), (1 - loss) * (1 - memory)
     std = math.sqrt(1 - leave) / leave / math.sqrt(len(runs))
     assert runs.mean() == pytest.approx(1 / leave, abs=5 * std)
-    if burst == 0.02 and loss < 0.5:  # twenty packets: the sampling no longer matters
+    if burst == 0.02 and loss < 0.5:  # twenty packets: the effect of sampling is negligible
         assert 1 / leave == pytest.approx(burst / PERIOD, rel=0.04)
 
 
-def test_a_network_is_as_bad_at_its_first_step_as_later():
+def test_loss_is_equal_at_the_first_and_later_steps():
     config = NetworkConfig(loss=0.3, burst=10.0)
     lost = [packet_delays(config, seed, FORWARD, 1, PERIOD)[0, 0] < 0 for seed in range(2000)]
     assert np.mean(lost) == pytest.approx(0.3, abs=5 * math.sqrt(0.21 / 2000))
 
 
-def test_bursts_last_as_long_at_every_packet_rate():
+def test_burst_length_is_independent_of_the_packet_rate():
     config, lengths = NetworkConfig(loss=0.2, burst=0.05), []
     for period in (5e-4, 2e-3):
         lost = packet_delays(config, 5, FORWARD, MANY, period)[:, 0] < 0
@@ -343,18 +342,18 @@ def test_bursts_last_as_long_at_every_packet_rate():
     assert lengths[1] == pytest.approx(0.05, rel=0.1)
 
 
-def test_bad_states_lose_their_share_and_good_ones_nothing():
+def test_only_bad_states_lose_packets():
     config = NetworkConfig(loss=0.19, burst=0.5, burst_loss=0.95)
     lost = packet_delays(config, 6, FORWARD, 10 * MANY, PERIOD)[:, 0] < 0
     share = np.convolve(lost, np.ones(20), "valid") / 20
-    # Windows of 20 ms inside a state: none is lost, or about 95 %; few lie in between.
+    # Within a state, windows of 20 ms lose no packet or about 95 %; few are in between.
     bad = share > 0.5
     assert bad.mean() == pytest.approx(0.2, abs=0.02)
     assert share[bad].mean() == pytest.approx(0.95, abs=0.02)
     assert (share[~bad] == 0).mean() > 0.97
 
 
-def test_duplicates_are_a_share_of_what_arrives():
+def test_fraction_of_arrived_packets_is_duplicated():
     config = replace(ROUGH, burst=0.0)
     first, second = packet_delays(config, 0, FORWARD, MANY, PERIOD).T
     arrived = first >= 0
@@ -366,7 +365,7 @@ def test_duplicates_are_a_share_of_what_arrives():
 @given(st.floats(1.0, 3000.0))
 @example(1000.0)
 @example(290.0)
-def test_the_sender_keeps_to_the_rate_and_sends_evenly(rate):
+def test_sender_sends_evenly_at_the_configured_rate(rate):
     steps = 5000
     delays = packet_delays(NetworkConfig(rate_hz=rate), 0, FORWARD, steps, PERIOD)[:, 0]
     sent = np.flatnonzero(delays >= 0)
@@ -399,15 +398,15 @@ def test_presets_have_their_round_trip_time(name, round_trip):
     assert sum(means) * period == pytest.approx(round_trip, rel=0.01)
 
 
-def test_every_preset_is_named_here():
+def test_list_of_presets_is_complete():
     assert list(PRESETS) == ["ideal", "lan", "wan", "internet", "geostationary", "lunar"]
 
 
-# What the receiver reads while nothing comes.
+# Received packet without arrivals
 
 
-def lonely(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
-    """A packet that moves and turns, and what is read so many steps after it, the last one."""
+def receive_after_silence(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a packet with motion, and the packet received `silent` steps after it."""
     p = network_parameters(NetworkConfig(silence=silence, rate_hz=1.0), 0, FORWARD, PERIOD)
     packet = random_packets(1)[0]
     packet[POSE][:4] /= np.linalg.norm(packet[POSE][:4])
@@ -421,8 +420,8 @@ def lonely(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])
 @pytest.mark.parametrize("silent", [0, 1, 50, 300])
-def test_silence(silence, silent):
-    packet, received = lonely(silence, silent)
+def test_packet_is_held_zero_or_extrapolated_during_silence(silence, silent):
+    packet, received = receive_after_silence(silence, silent)
     expected = packet.copy()
     if silent and silence == "zero":
         expected[VELOCITY] = expected[WRENCH] = expected[PACKET_LOAD_WRENCH] = 0.0
@@ -436,12 +435,12 @@ def test_silence(silence, silent):
         if silent * PERIOD > MAX_POSE_EXTRAPOLATION_S:
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
-    # Whatever the policy, counters and integrals stand still: silence brings no energy.
+    # Counters and integrals are constant for any policy: silence adds no energy.
     for part in (INTEGRAL, slice(CUMULATIVE_ENERGY.start, PACKET_LOAD_WRENCH.start)):
         np.testing.assert_array_equal(received[part], packet[part])
 
 
-def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first():
+def test_packet_size_equals_that_of_the_neutral_packet():
     p = network_parameters(NetworkConfig(), 0, FORWARD, PERIOD)
     packets, received = random_packets(3), np.zeros(PACKET_SIZE)
     state = initial_network_state(p, np.zeros(PACKET_LOAD_WRENCH.start))
@@ -456,13 +455,13 @@ def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first()
 
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])
-def test_before_the_first_packet_there_are_zeros(silence):
+def test_output_is_zero_before_the_first_packet(silence):
     config = NetworkConfig(delay=0.05, silence=silence)
     received, newest, _ = exchange(config, random_packets())
     assert (newest[:50] == -1).all() and not received[:50].any()
 
 
-# Recorded delays.
+# Recorded delays
 
 
 def write_trace(path, text: str) -> NetworkConfig:
@@ -470,7 +469,7 @@ def write_trace(path, text: str) -> NetworkConfig:
     return NetworkConfig(trace=str(path))
 
 
-def test_a_trace_is_played_as_recorded_and_starts_again(tmp_path):
+def test_trace_is_replayed_periodically(tmp_path):
     config = write_trace(
         tmp_path / "net.csv", "time,delay\n10.000,0.004\n10.002,\n10.003,0.0021\n10.005,0\n"
     )
@@ -520,7 +519,7 @@ def test_missing_trace_file_is_named():
         network_parameters(NetworkConfig(trace="nowhere.csv"), 0, FORWARD, PERIOD)
 
 
-# The configuration.
+# Configuration
 
 
 @pytest.mark.parametrize(
@@ -542,7 +541,7 @@ def test_invalid_values_are_rejected(change, named):
         network_parameters(NetworkConfig(**change), 0, FORWARD, PERIOD)
 
 
-def test_it_loads_from_yaml():
+def test_config_is_loaded_from_yaml():
     text = "{delay: 0.1, distribution: gamma, rate_hz: 500, trace: net.csv, redundant: true}"
     loaded = yaml_load_typed(schema=NetworkConfig, data=text, defaults=NetworkConfig())
     expected = NetworkConfig(
@@ -557,10 +556,10 @@ def test_it_loads_from_yaml():
         (NetworkConfig(delay=0.02), network.FORWARD, 1e-3),
         (NetworkConfig(delay=0.3, rate_hz=50.0), network.BACKWARD, 0.02),
         (NetworkConfig(loss=1.0), network.FORWARD, math.inf),
-        # The longest of the bad states of a minute, some n = 60 (0.3 / 0.08): 0.08 ln(n) and more.
+        # Longest bad state of a minute with n = 60 (0.3 / 0.08): at least 0.08 ln(n).
         (NetworkConfig(delay=0.05, jitter=0.5, loss=0.3, burst=0.08), network.BACKWARD, 0.49),
     ],
 )
-def test_the_longest_silence_of_a_minute(config, direction, longest):
+def test_longest_silence_in_a_minute_is_estimated(config, direction, longest):
     found = network.longest_silence(config, direction, 1e-3)
     assert found == pytest.approx(longest, rel=0.15 if config.burst else 1e-9)

@@ -88,8 +88,8 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     assert pl.read_parquet(out / "runs.parquet").height == 2
     page = (out / "report.html").read_text()
     assert "round trip 1 ms" in page
-    # All columns are seen in a window of 1200 px, of which the page takes 944: a letter has about
-    # 8.5 px, and a column 11 px to its neighbour. Headings take as many lines as they have words.
+    # All columns are visible in a window of 1200 px, of which the page uses 944: a letter has about
+    # 8.5 px, and a column 11 px to its neighbour. Headings have one line a word.
     assert re.search(r"\nth\.number {[^}]*white-space: normal", page)
     rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in RUN_COLUMNS)]]
     rows += [["four_channel", "yes", *run_cells(row)] for row in summary["station"]]
@@ -113,7 +113,7 @@ def test_unknown_names_raise(tmp_path, arguments, message):
 
 
 def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
-    """It keeps tool and grip, and gets the study's rates and leaves."""
+    """The comparison keeps tool and grip, and uses the rates and leaves of the study."""
     mine = tmp_path / "mine.yaml"
     mine.write_text(
         "{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {},"

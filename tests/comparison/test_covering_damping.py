@@ -16,7 +16,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 FIRM = OneDof(hand_stiffness=2e5, hand_damping=500.0, device_friction=0.0)
 
 
-def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping: float) -> float:
+def hand_work(model: OneDof, round_trip: float, frequency: float, damping: float) -> float:
     """Return the energy from hand and damping over whole periods of a small oscillation [J].
 
     The swing is around a point in the wall, or far from it if there is no wall.
@@ -45,9 +45,9 @@ def test_covering_damping_compensates_the_energy_of_the_delay(wall, round_trip):
     ]
     frequency = max(worst / (2 * np.pi), 0.5)
     assert damping > 1.0
-    without = work_of_the_hand(model, round_trip, frequency, 0.0)
+    without = hand_work(model, round_trip, frequency, 0.0)
     assert without < 0.0
-    assert work_of_the_hand(model, round_trip, frequency, damping) == pytest.approx(
+    assert hand_work(model, round_trip, frequency, damping) == pytest.approx(
         0.0, abs=0.05 * abs(without)
     )
 

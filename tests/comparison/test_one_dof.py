@@ -125,7 +125,7 @@ def free_windows(grip: str) -> list[float]:
 
 
 def test_light_hand_has_an_unstable_window_in_free_motion():
-    """With sigma = 1 it is unstable between 190 and 339 ms."""
+    """The hand is unstable between 190 and 339 ms at sigma = 1."""
     first, last = (edge / PERIOD for edge in free_windows("light"))
     assert (first, last) == (pytest.approx(190, abs=1), pytest.approx(339, abs=1))
     model = held("light", sigma=1.0)
@@ -145,7 +145,7 @@ def test_default_hand_and_servo_are_those_of_the_station():
     assert model.velocity_gain == 2 * math.pi * servo.velocity_bandwidth_hz
 
     def late_and_half_power(axis: OneDof) -> tuple[float, float]:
-        """Delay at low frequency [s], and where the slave has 1 / sqrt(2) of the command [Hz]."""
+        """Return the low-frequency delay [s] and the half-power frequency of the slave [Hz]."""
         axis = OneAxis(position_gain=axis.position_gain, velocity_gain=axis.velocity_gain)
 
         def excess(f: float) -> float:

@@ -114,10 +114,10 @@ def test_station_without_channel_raises():
 
 @pytest.mark.parametrize("sigma", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_station_with_ledger_creates_no_energy(sigma):
-    """A hand strikes a leaf over a lossy network with 50 ms of delay.
+    """A hand hits a leaf over a lossy network with 50 ms of delay.
 
-    With `none` hand and leaf get 0.45 J and, by rotation, 0.30 J out of this. Where the load is
-    felt it is part of what may get no more than was put in.
+    `none` creates 0.45 J at hand and leaf and, by rotation, 0.30 J. The energy of the displayed
+    load is part of the balance.
     """
     strike = MinimumJerk(t_start=0.3, duration=0.25, translation=[0.0, 0.0, -0.08])
     scenario = replace(

@@ -32,7 +32,7 @@ def test_the_default_leaf_is_that_of_the_hardware_notes():
     assert sheet.max_linear_deflection == pytest.approx(0.017)
 
 
-def test_it_rings_at_the_frequency_of_its_stiffness_and_mass_and_decays():
+def test_leaf_has_the_frequency_of_its_stiffness_and_mass_and_decays():
     sheet = SheetSpring(thickness=0.001, damping_ratio=0.02)
     plant, simulator = leaf(sheet)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -42,12 +42,12 @@ def test_it_rings_at_the_frequency_of_its_stiffness_and_mass_and_decays():
     period = 2 * np.pi / damped
     simulator.get_mutable_integrator().set_target_accuracy(1e-9)
     simulator.AdvanceTo(3 * period)
-    # After three whole periods: the envelope of the free decay.
+    # Envelope of the free decay after three whole periods.
     expected = 0.005 * np.exp(-0.02 * omega * 3 * period)
     assert plant.GetPositions(context)[0] == pytest.approx(expected, rel=1e-4)
 
 
-# Down into the leaf by 2 mm, at once, and up again.
+# Down into the leaf by 2 mm in one step, and up again.
 STRIKE = [
     MinimumJerk(t_start=0.01, duration=0.14, translation=[0.004, 0.003, -0.058]),
     MinimumJerk(t_start=0.19, duration=0.14, translation=[0.0, 0.0, 0.058]),
@@ -57,9 +57,7 @@ STRIKE = [
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
-    """RK2 at the sensor's 125 us against error-controlled RK3 at half of that, which is as good as
-    at an eighth: both are 8e-7 m away.
-    """
+    """RK2 at the sensor's 125 us differs by 8e-7 m from RK3 with error control at half of it."""
     scenario = replace(
         LoadScenario("contact_transition"),
         wrist_sensor__ideal=True,
@@ -67,7 +65,7 @@ def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
         simulation__duration=0.3,
         operator__intent=STRIKE,
         rates__log_hz=8000.0,
-        force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
+        force_scaling__sigma=1.0,  # no identified load is required
     )
     tight = replace(
         scenario,

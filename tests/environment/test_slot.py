@@ -44,7 +44,7 @@ def slave_at(slot: Slot):
 
 
 def pairs_of_a_ball(slot: Slot) -> np.ndarray:
-    """The contact pairs of a body that is one ball about its origin, without any arm."""
+    """Return the contact pairs of a body with one ball about its origin, without an arm."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, PEG_RADIUS_M))
     friction = CoulombFriction(1.0, 1.0)
@@ -59,7 +59,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 
-def test_the_peg_is_the_tools_ball_and_another_of_its_size():
+def test_peg_is_two_balls_of_the_size_of_the_tool():
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = ParseSlave(plant).tool
     mass = plant.get_body(tool).default_mass()
@@ -77,7 +77,7 @@ def test_the_peg_is_the_tools_ball_and_another_of_its_size():
     assert plant.get_body(tool).default_mass() == mass
 
 
-def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
+def test_stand_reaches_from_the_ground_to_the_lowest_box():
     slot = Slot(position=[0.5, -0.2, 0.4], depth=0.03, chamfer=0.004, yaw=0.3)
     corners = np.array(list(product([-0.5, 0.5], repeat=3)))
     lowest = min(
@@ -107,14 +107,14 @@ def test_contact_does_not_pull_a_fast_ball():
 
 
 def profile(slot: Slot) -> np.ndarray:
-    """Corners of the right half of the section [m]: (y, z) in M from the floor to far outside."""
+    """Return corners of the right half of the section [m]: (y, z) in M from the floor outwards."""
     edge, c = slot.width / 2, slot.chamfer
     corners = [[0.0, -slot.depth], [edge, -slot.depth], [edge, -c], [edge + c, 0.0]]
     return np.array([*corners, [edge + c + 0.03, 0.0]])
 
 
 def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
-    """Of a point to a line through corners."""
+    """Return the distance from a point to a line through corners."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     share = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
     nearest = start + np.clip(share, 0.0, 1.0)[:, np.newaxis] * along
@@ -132,11 +132,11 @@ def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
     y=st.floats(-1.0, 1.0),
     z=st.floats(-1.0, 1.0),
 )
-def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
+def test_boxes_fill_the_section(yaw, chamfer, clearance, depth, x, y, z):
     """The depth of a ball in its deepest box is the distance of its centre to the section."""
     slot = Slot(yaw=yaw, chamfer=chamfer, clearance=clearance, depth=depth)
     corners = profile(slot)
-    # Anywhere above the outline: what is in the material is for no ball to reach.
+    # Points above the outline, because a ball cannot be inside the material.
     across = y * (slot.width / 2 + chamfer + 0.01)
     floor = np.interp(abs(across), corners[:, 0], corners[:, 1])
     height = floor + 1e-4 + (z + 1.0) * 0.02
@@ -154,7 +154,7 @@ def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
 
 
 def test_walls_tops_and_floor_end_flush():
-    """There is no contact beyond the end of a block."""
+    """Blocks have no contact beyond their ends."""
     pairs = pairs_of_a_ball(Slot(position=[0.0, 0.0, 0.0]))
     level = np.all(pairs[:, 4:13].round(12) == np.eye(3).ravel(), axis=1)  # all but the chamfers
     assert np.count_nonzero(level) == 5
@@ -167,7 +167,7 @@ DEEP = Slot(position=[0.55, 0.0, 0.2], clearance=1e-3, stiffness=1e4, depth=0.05
 
 
 def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
-    """On the peg at rest, about the world's origin; tilted about the slot from the vertical.
+    """Return the wrench on the peg at rest about the world's origin.
 
     Args:
         slave: with the slot DEEP.
@@ -197,7 +197,7 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     return wrench
 
 
-def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
+def test_both_balls_of_an_upright_peg_touch_beyond_the_clearance():
     slave = slave_at(DEEP)
     assert not wrench_at(slave, 0.0, 0.499e-3).any()
     assert not wrench_at(slave, 0.0, -0.499e-3).any()
@@ -228,10 +228,10 @@ def inserted():
     return scenario, simulate(station, scenario.simulation)
 
 
-def test_the_peg_finds_in_is_slid_down_and_stands_quietly_on_the_floor(inserted):
+def test_peg_enters_the_slot_and_rests_on_the_floor(inserted):
     _, result = inserted
     force = result["true_contact_wrench_W"][:, :3]
-    # It starts free; the chamfer on the side of the offset pushes it back and up.
+    # The peg starts free; the chamfer on the side of the offset pushes it back and up.
     first = np.flatnonzero(force.any(axis=1))[0]
     assert 0.3 < result.t[first] < 1.0
     assert force[first + 5, 1] < 0.0 < force[first + 5, 2]
@@ -259,7 +259,7 @@ def test_contact_only_takes_energy_from_the_tool(inserted):
     assert work[-1] < -0.02
 
 
-def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted, meshcat):
+def test_replay_contains_slot_and_peg_at_their_poses(inserted, meshcat):
     scenario, result = inserted
     scene = ReplayScene(meshcat, scenario, result)
     scene.show_sample(0.0, result, len(result.t) - 1)

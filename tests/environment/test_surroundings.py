@@ -58,7 +58,7 @@ SOFT_PAD = """
 
 
 def test_walls_and_boxes_follow_drakes_contact_law():
-    """In a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
+    """The ball is in a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
     corner = SeveralObjects(
         [
             Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),
@@ -114,7 +114,7 @@ CABINET = """
 
 
 def test_moving_bodies_follow_drakes_contact_law(tmp_path):
-    """A block that tips over, and a drawer that slides in a rotating door."""
+    """A block falls over, and a drawer slides in a rotating door."""
     (tmp_path / "cabinet.sdf").write_text(CABINET)
     cabinet = Scene(file=str(tmp_path / "cabinet.sdf"), position=[0.4, 0.0, 0.1])
     both = SeveralObjects([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
@@ -152,10 +152,10 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touched.add((bool(k % 2), bool(expected.any())))
     assert slave.contact.drake_contact_reason == ""
-    assert len(touched) == 4  # with the block near and far: touching, and not
+    assert len(touched) == 4  # with contact of the block and without
 
 
-def test_between_two_states_bodies_move_on_smoothly():
+def test_bodies_move_smoothly_between_two_states():
     """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
@@ -195,7 +195,7 @@ def pad(tmp_path_factory) -> str:
 def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
     """A pushed block, a pressure field, a leaf beside a wall; at the sensor's 8 kHz."""
     things = {
-        "block": [Block(position=[0.561, 0.0, 0.2])],  # which the ball begins 1 mm deep in
+        "block": [Block(position=[0.561, 0.0, 0.2])],  # the ball begins 1 mm deep in it
         "pad": [Scene(file=pad, position=[0.5, 0.0, 0.241], contact="hydroelastic")],
         "leaf": [SheetSpring(position=[0.5, 0.0, 0.251]), Wall(position=[0.4, 0.0, 0.252])],
     }
@@ -215,7 +215,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
     context, sensed = plant.GetMyContextFromRoot(root), sensor.GetMyContextFromRoot(root)
     place = list(plant.GetJointIndices()).index(plant.GetJointByName("sensor_weld").index())
     truth, peak, error = station.GetOutputPort("true_contact_wrench_W"), 0.0, 0.0
-    # What the compiled law knows is sampled inside steps, and now only where the torque changes.
+    # Sampling with the compiled law is inside steps, and now only where the torque changes.
     due = 4 if case == "block" else 1
     for k in range(due, 161, due):
         simulator.AdvanceTo(k * 0.000125)
@@ -238,11 +238,11 @@ def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
     """A box inside the ball, out of reach, makes Drake compute the same samples."""
     asked, wrench_W = [], ContactPlantCopy.wrench_W
 
-    def remember(twin, x, state):
+    def record_call(twin, x, state):
         asked.append((x.copy(), state.copy()))
         return wrench_W(twin, x, state)
 
-    monkeypatch.setattr(ContactPlantCopy, "wrench_W", remember)
+    monkeypatch.setattr(ContactPlantCopy, "wrench_W", record_call)
     ball, box = Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.188])
     logs, watched = [], []
     for shapes in ([ball], [ball, box]):
@@ -253,14 +253,14 @@ def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
             wrist_sensor__ideal=True,
             simulation__settle=0.0,
             simulation__duration=0.006,
-            rates__log_hz=2000.0,  # of the sample before now, which lies inside a step
+            rates__log_hz=2000.0,  # sample before the present one, inside a step
         )
         station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
         logs.append(simulate(station, scenario.simulation))
         slave = AddSlavePlant(DiagramBuilder(), scenario.slave, scenario.surroundings)
         watched.append(len(slave.contact.monitored_pairs))
     assert watched == [0, 2]  # its table, too
-    # Every number of a state that Drake is asked in is one: the arm's stands twice in it.
+    # All numbers of the state differ; it contains that of the arm twice.
     start = slave.arm.num_joints
     assert len(asked) > 10
     for x, state in asked:
@@ -293,7 +293,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
+def test_pushed_block_resists_by_friction():
     """mu m g in steady sliding; the summary has the distance."""
     scenario = replace(LoadScenario("push_block"), wrist_sensor__ideal=True)
     estimate = true_load(scenario)
@@ -301,7 +301,7 @@ def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
     (block,) = scenario.environment
     (sliding,) = np.nonzero((result.t > 0.6) & (result.t < 1.1))
     f = result["true_contact_wrench_W"][sliding, :3].mean(axis=0)
-    # The ball rubs on the block, too, and presses it down by what pushes the ball up.
+    # The ball also rubs on the block, and presses it down by the upward force on the ball.
     weight = block.mass * 9.81 + f[2]
     speed = np.gradient(result["pose_of_block"][:, 4], result.t)[sliding]
     push = -f[0] - block.mass * (speed[-1] - speed[0]) / np.ptp(result.t[sliding])
@@ -326,7 +326,7 @@ def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
     scenario = replace(Scenario(), environment=[Block(), door])
     turned = RollPitchYaw(0.1, -0.2, 0.5).ToQuaternion().wxyz()
     opened = RollPitchYaw(0.0, 0.0, 0.7 + 0.6).ToQuaternion().wxyz()
-    # The hinge stays where it is.
+    # The hinge does not move.
     p_DoorHinge = np.array([0.01, 0.02, 0.03])
     closed, open_ = (RotationMatrix(RollPitchYaw(0.0, 0.0, yaw)) for yaw in (0.7, 1.3))
     place = np.array([0.4, 0.3, 0.1]) + closed @ p_DoorHinge - open_ @ p_DoorHinge

@@ -47,7 +47,7 @@ def floor() -> NoiseFloor:
 
 @pytest.mark.parametrize("statistic", ["level", "glr"])
 def test_block_equals_the_detector_of_logs(arm, statistic):
-    """Of a load that moves, and is pushed; samples that are saturated, or none, change nothing.
+    """The load moves and is pushed; saturated and missing samples change nothing.
 
     The wrench drifts much faster than the detector follows.
     """

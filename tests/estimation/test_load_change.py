@@ -1,4 +1,4 @@
-"""Another load with the samples of the station's wrist sensor: filtered, quantised noise, 8 kHz."""
+"""Load change detected from the station's wrist sensor: filtered, quantised noise, 8 kHz."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OBJECT = phi_from_mass_com_inertia(0.8, [0.04, 0.0, 0.16], np.diag([8e-4, 8e-4, 
 
 
 def samples(seed, grasp=False, duration=8.0):
-    """(N, 15) at 8 kHz: sines, through the sensor's noise, converter and filter."""
+    """Return (N, 15) at 8 kHz: sines, through the sensor's noise, converter and filter."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, 1.0 / RATE)
     frequency, phase = rng.uniform(0.2, 1.2, (9, 3)), rng.uniform(0.0, 6.28, (9, 3))
@@ -59,7 +59,7 @@ def tool():
     return identify_batch(*parts(samples(99)), method="total", noise=noise).identification
 
 
-def watch(tool, rows, period):
+def monitor(tool, rows, period):
     """Return the states (N,) and the identified load."""
     parameters = change_detector_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), period)
     memory = initial_change_memory(np.concatenate([tool.offsets, tool.phi]), tool.covariance)
@@ -70,14 +70,14 @@ def watch(tool, rows, period):
 
 def test_no_alarm_in_free_motion(tool):
     for seed in range(3):
-        assert watch(tool, samples(seed), 1 / RATE)[0].max() == STATE_KNOWN
+        assert monitor(tool, samples(seed), 1 / RATE)[0].max() == STATE_KNOWN
 
 
 @pytest.mark.parametrize("keep", [1, 8])
-def test_a_grasp_at_8_and_at_1_khz(tool, keep):
+def test_grasp_is_detected_at_8_and_at_1_khz(tool, keep):
     """The given noise is that before the filter, at either rate."""
     for seed in range(3):
-        states, load = watch(tool, samples(seed, grasp=True)[::keep], keep / RATE)
+        states, load = monitor(tool, samples(seed, grasp=True)[::keep], keep / RATE)
         assert states[: int(EVENT * RATE / keep)].max() == STATE_KNOWN
         after = np.argmax(states >= STATE_CHANGED) * keep / RATE - EVENT
         assert 0.0 < after < 0.5

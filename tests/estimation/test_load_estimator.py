@@ -21,7 +21,7 @@ INERTIAS = [10, 13, 15]
 
 
 def samples(seed, duration=1.5, rate=8000.0, keep=8):
-    """(N, 22): what the wrist sensor gives at 1 kHz, its noise through its filter."""
+    """Return (N, 22) outputs of the wrist sensor at 1 kHz, with filtered noise."""
     rng, phases = np.random.default_rng(seed), np.random.default_rng(0).uniform(0, 6.28, (9, 4))
     t = np.arange(0.0, duration, 1 / rate)
     waves = np.sin(2 * np.pi / 1.5 * np.arange(1, 5) * t[:, None, None] + phases).sum(axis=2)
@@ -43,7 +43,7 @@ def by(method):
 
 
 def run(system, rows):
-    """The estimates and `settled` after each row."""
+    """Return the estimates and `settled` after each row."""
     context = system.CreateDefaultContext()
     history = []
     for row in rows:
@@ -74,7 +74,7 @@ def MakeEstimator(initial=None, **config):
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_block_equals_the_estimator_of_logs(method):
     rows = samples(0, duration=0.3)
-    rows[20, 15] = 1.0  # saturated: not learnt from
+    rows[20, 15] = 1.0  # saturated samples are not used
     history = run(MakeEstimator(method=method), rows)
     usable = np.delete(rows, 20, axis=0)
     log = by(method)

@@ -41,7 +41,7 @@ SCENARIO = replace(
     LoadScenario("identification"), load_estimator__watch=True, load_estimator__method="rtls"
 )
 SENSOR = SCENARIO.wrist_sensor
-# What `excite` finds for the station's slave, rounded.
+# Result of `excite` for the station's slave, rounded.
 TRAJECTORY = FourierTrajectory(
     np.array([-0.1481, -0.5268, -1.2922, 1.9415, -0.2313, -1.2508]),
     np.array([
@@ -66,12 +66,12 @@ TRAJECTORY = FourierTrajectory(
 
 @pytest.fixture(scope="module")
 def tool():
-    """phi of the plant's tool, which only the tests know."""
+    """Return phi of the plant's tool, which the station does not use."""
     return AddSlavePlant(DiagramBuilder(), SCENARIO.slave, None).arm.phi_load
 
 
-def grasp(station, simulator):
-    """From now on the tool holds the object: in the plant, and in what the sensor feels."""
+def attach_object(station, simulator):
+    """Add the object to the tool of the plant and to the wrist sensor's load."""
     plant = GetBlock(station, "slave_plant")
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     body = plant.GetBodyByName("tool")
@@ -83,19 +83,19 @@ def grasp(station, simulator):
 
 @pytest.fixture(scope="module")
 def grasped():
-    """The excitation, with a grasp in the middle of it."""
+    """Return signals of the excitation with a grasp in the middle."""
     station = MakeIdentificationStation(SCENARIO, TRAJECTORY)
     simulator = MakeSimulator(station, SCENARIO.simulation)
     simulator.Initialize()
     advance_without_garbage_collection(simulator, GRASP)
-    grasp(station, simulator)
+    attach_object(station, simulator)
     advance_without_garbage_collection(simulator, SCENARIO.simulation.duration)
     return read_recorded_signals(simulator, 0.0)
 
 
 @pytest.fixture(scope="module")
-def known(grasped):
-    """The tool by the samples before the grasp: [offsets; phi] and its covariance."""
+def prior(grasped):
+    """Return [offsets; phi] and covariance of the tool from the samples before the grasp."""
     names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
     estimator = RecursiveTotalLeastSquares(SENSOR.wrench_std(), SENSOR.motion_std())
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
@@ -103,14 +103,14 @@ def known(grasped):
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
 
 
-def first(result, state, after=0.0):
-    """When the state is `state` for the first time after a time [s]."""
+def time_of(result, state, after=0.0):
+    """Return the first time [s] of a state after a given time."""
     return result.t[np.argmax((result["load_state"][:, 0] == state) & (result.t >= after))]
 
 
 @pytest.mark.slow
-def test_it_settles_and_freezes(grasped, tool):
-    settled = first(grasped, STATE_SETTLED)
+def test_estimate_settles_and_freezes(grasped, tool):
+    settled = time_of(grasped, STATE_SETTLED)
     assert 0.1 < settled < 1.5
     during = (grasped.t >= settled) & (grasped.t < GRASP)
     assert (grasped["load_state"][during] == STATE_SETTLED).all()
@@ -127,10 +127,10 @@ def test_it_settles_and_freezes(grasped, tool):
 @pytest.mark.slow
 def test_grasp_is_detected_and_the_object_identified(grasped):
     """The change is detected within half a second, the new load soon after."""
-    assert first(grasped, STATE_DISTURBED) - GRASP < 0.05
-    changed = first(grasped, STATE_OTHER_LOAD)
+    assert time_of(grasped, STATE_DISTURBED) - GRASP < 0.05
+    changed = time_of(grasped, STATE_OTHER_LOAD)
     assert changed - GRASP < 0.5
-    again = first(grasped, STATE_SETTLED, changed)
+    again = time_of(grasped, STATE_SETTLED, changed)
     assert changed < again < changed + 2.0
     before, after = (grasped["load_estimate"][k, 6:] for k in (2900, -1))
     assert (after - before)[0] == pytest.approx(MASS, rel=0.01)
@@ -141,19 +141,19 @@ def test_grasp_is_detected_and_the_object_identified(grasped):
 
 @pytest.mark.slow
 def test_estimate_changes_without_a_step(grasped):
-    """Between two loads nothing is eliminated; each sample moves the estimate by 1 %."""
+    """The load is zero between two loads; each sample changes the estimate by 1 %."""
     phi = grasped["load_estimate"][:, 6:]
-    faded = phi[grasped.t < first(grasped, STATE_SETTLED, first(grasped, STATE_OTHER_LOAD))][-1]
+    faded = phi[grasped.t < time_of(grasped, STATE_SETTLED, time_of(grasped, STATE_OTHER_LOAD))][-1]
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
-    watched = grasped.t > first(grasped, STATE_SETTLED) + 0.01
+    watched = grasped.t > time_of(grasped, STATE_SETTLED) + 0.01
     steps = np.abs(np.diff(phi[watched], axis=0))
     assert (steps <= 1e-3 / LOAD_FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_contacts_are_not_a_change_of_load(known):
-    """Fig. 8, and lasting contact with the leaf, at rest and sliding: no change."""
+def test_contacts_are_not_a_change_of_load(prior):
+    """Contacts of Fig. 8, and lasting contact with the leaf at rest and sliding, change nothing."""
     touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
     press = MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.075])
     hold = replace(
@@ -173,7 +173,7 @@ def test_contacts_are_not_a_change_of_load(known):
         (hold, STATE_DISTURBED),
         (slide, STATE_DISTURBED),
     ):
-        station = MakeTeleopStation(scenario, load_estimate=known[0], load_covariance=known[1])
+        station = MakeTeleopStation(scenario, load_estimate=prior[0], load_covariance=prior[1])
         result = simulate(station, scenario.simulation)
         states = result["load_state"][:, 0]
         assert states[0] == STATE_SETTLED and states[-1] == last
@@ -181,12 +181,12 @@ def test_contacts_are_not_a_change_of_load(known):
         touched = np.any(result["true_contact_wrench_W"] != 0.0, axis=1)
         assert result.t[states == STATE_DISTURBED][0] - result.t[touched][0] < 0.1
         np.testing.assert_array_equal(
-            result["load_estimate"][:, 6:], np.broadcast_to(known[0][6:], (len(states), 10))
+            result["load_estimate"][:, 6:], np.broadcast_to(prior[0][6:], (len(states), 10))
         )
 
 
 def at_rest(theta, added, seed):
-    """(N, 15) samples at 1 kHz with the arm at rest, `added` (N, 6) to the wrench."""
+    """Return (N, 15) samples at 1 kHz with the arm at rest, `added` (N, 6) to the wrench."""
     rng, n = np.random.default_rng(seed), len(added)
     s, zero = np.tile([0.0, 3.0, 9.34], (n, 1)), np.zeros((n, 3))
     wrench = theta[:6] + non_contact_wrench(s, zero, zero, theta[6:]) + added
@@ -194,9 +194,9 @@ def at_rest(theta, added, seed):
     return np.hstack([wrench, s, zero, zero]) + std / np.sqrt(8.0) * rng.normal(size=(n, 15))
 
 
-def watch(known, rows, fallback=None):
-    """What is handed out (N, 16), and the states (N,)."""
-    theta, covariance = known
+def monitor_samples(prior, rows, fallback=None):
+    """Return the output loads (N, 16), and the states (N,)."""
+    theta, covariance = prior
     out, memory = theta.copy(), initial_monitor_memory(theta, covariance)
     options = change_detector_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), 1e-3)
     handed, states = np.empty((len(rows), 16)), np.empty(len(rows))
@@ -207,36 +207,36 @@ def watch(known, rows, fallback=None):
     return handed, states
 
 
-def test_offsets_are_kept_at_rest(known):
-    """They drift by more than 1 N, within 3 s by less than the contact threshold."""
+def test_offsets_are_kept_at_rest(prior):
+    """The offsets drift by more than 1 N, within 3 s by less than the contact threshold."""
     t = np.arange(0.0, 30.0, 1e-3)[:, None]
     drift = t / 30.0 * np.array([1.5, -1.0, 1.5, 0.05, -0.05, 0.05])
-    handed, states = watch(known, at_rest(known[0], drift, 0))
+    handed, states = monitor_samples(prior, at_rest(prior[0], drift, 0))
     assert (states == STATE_SETTLED).all()
-    wrong = handed[-1, :6] - known[0][:6] - drift[-1]
+    wrong = handed[-1, :6] - prior[0][:6] - drift[-1]
     assert (np.abs(wrong) < 0.15 * np.abs(drift[-1]) + np.repeat([0.05, 0.002], 3)).all()
-    np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
+    np.testing.assert_allclose(handed[-1, 6:], prior[0][6:], rtol=1e-12)
 
 
-def test_a_push_at_rest_is_neither_an_offset_nor_a_load(known):
+def test_a_push_at_rest_is_neither_an_offset_nor_a_load(prior):
     added = np.zeros((6000, 6))
-    added[1000:] = [0.0, -1.5, -4.67, 0.3, 0.0, 0.0]  # along gravity, as half a kilogram would pull
-    handed, states = watch(known, at_rest(known[0], added, 1))
+    added[1000:] = [0.0, -1.5, -4.67, 0.3, 0.0, 0.0]  # along gravity, like half a kilogram
+    handed, states = monitor_samples(prior, at_rest(prior[0], added, 1))
     assert states[900] == STATE_SETTLED
     assert (states[1100:] == STATE_DISTURBED).all()
-    assert (np.abs(handed[-1, :6] - known[0][:6]) < np.repeat([0.1, 0.005], 3)).all()
-    np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
+    assert (np.abs(handed[-1, :6] - prior[0][:6]) < np.repeat([0.1, 0.005], 3)).all()
+    np.testing.assert_allclose(handed[-1, 6:], prior[0][6:], rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_known_gripper_stays_eliminated(known, grasped):
+def test_known_gripper_stays_eliminated(prior, grasped):
     names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
     rows = np.hstack([grasped[name] for name in (*names, "angular_acceleration_S")])[2500:]
-    gripper = 0.5 * known[0][6:]
-    handed, states = watch(known, rows, gripper)
+    gripper = 0.5 * prior[0][6:]
+    handed, states = monitor_samples(prior, rows, gripper)
     faded = handed[states == STATE_OTHER_LOAD][-1, 6]
     assert faded == pytest.approx(gripper[0], rel=0.02)
-    assert handed[-1, 6] == pytest.approx(known[0][6] + MASS, rel=0.01)
+    assert handed[-1, 6] == pytest.approx(prior[0][6] + MASS, rel=0.01)
 
 
 def test_watch_without_a_load_is_rejected():

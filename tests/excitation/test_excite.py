@@ -631,7 +631,7 @@ def test_model_options_require_a_model(capsys, tmp_path):
         pytest.param((write_sdf, "wrist", 7), id="sdf", marks=pytest.mark.long),
     ],
 )
-def foreign(request, tmp_path_factory):
+def other_arm(request, tmp_path_factory):
     """Return an arm, its trajectory from the command line, and its execution with 1.2 kg."""
     write, frame, joints = request.param
     folder = tmp_path_factory.mktemp("arm")
@@ -647,8 +647,8 @@ def foreign(request, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_files_for_other_arms(foreign):
-    out, joints, recording = foreign
+def test_files_for_other_arms(other_arm):
+    out, joints, recording = other_arm
     summary = json.loads((out / "summary.json").read_text())
     assert all(use["share"] <= 1 for use in summary["limit_use"].values())
     assert (out / "excitation.png").stat().st_size > 20_000
@@ -703,9 +703,9 @@ def write_described(folder, t, readings, recording):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
-def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
+def test_identified_load_of_another_arm_is_true(other_arm, write_log, tmp_path):
     """Design, execution, noisy measurement, log file, identification."""
-    _, joints, recording = foreign
+    _, joints, recording = other_arm
     sensor = dataclasses.replace(
         without_parts(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
     )

@@ -85,7 +85,7 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
 
 
 def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
-    """Without the accelerometer's noise the factor would be 2 to 5."""
+    """Noise of the accelerometer would make the factor 2 to 5."""
     problem, errors = (
         problem_of(slave),
         derivatives_over_tolerances(ASKED, slave.limits.heaviest_phi),

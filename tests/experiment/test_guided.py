@@ -29,8 +29,8 @@ EXPERIMENT = Experiment(
 )
 
 
-class Person:
-    """Participant with a clock, who presses in each interval."""
+class Participant:
+    """Participant with a clock who presses in each interval."""
 
     def __init__(self, folder) -> None:
         scenario = LoadScenario("contact_transition")
@@ -79,7 +79,7 @@ class Person:
 @pytest.mark.long
 @pytest.mark.slow
 def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
-    person = Person(tmp_path)
+    person = Participant(tmp_path)
     person.send(answer=1)  # not in the phase of an answer
     person.begin()
     person.send(set={"z": -1500, "sigma": 300, "gamma": 0})
@@ -87,7 +87,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person.wait("interval")
     person.send(set={"z": -2500})
     person.wait("answer")
-    person.send(client=2, answer=1)  # a spectator
+    person.send(client=2, answer=1)  # spectator
     assert person.procedure.phase == "answer"
     person.send(answer=2)
     (row,) = person.store.read_rows(1)
@@ -106,13 +106,13 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
 
 @pytest.mark.slow
 def test_trial_restarts_after_the_page_is_closed(tmp_path):
-    person = Person(tmp_path)
+    person = Participant(tmp_path)
     person.begin()
     person.send(set={"z": -1500})
     person.wait("gap")
     person.guided.leave(1, person.now)
     assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
-    person.send(client=2, go=True)  # has left
+    person.send(client=2, go=True)  # participant has disconnected
     person.guided.join(3, person.now)
     person.send(client=3, go=True)
     assert person.procedure.phase == "interval" and person.store.participant_numbers() == []

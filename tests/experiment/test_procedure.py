@@ -38,7 +38,7 @@ SHORT = dataclasses.replace(
 )
 
 
-def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
+def run_participant(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
     """Run a participant whose answers depend on the level, or until a number of trials."""
     while procedure.phase != "end" and procedure.trial_number < most:
         if procedure.phase == "interval":
@@ -69,20 +69,20 @@ def test_order_is_random_and_each_round_has_every_condition_once():
 def test_participant_continues_with_the_same_levels(tmp_path):
     """A new process has only the folder; an unfinished trial is lost."""
     whole, cut = TrialStore(tmp_path / "whole"), TrialStore(tmp_path / "cut")
-    go_through(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
+    run_participant(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
     rng = np.random.default_rng(1)
     first = Procedure(SMALL, 3, cut)
-    go_through(first, rng, 2.0, most=17)
+    run_participant(first, rng, 2.0, most=17)
     first.advance_phase()
     first.finish_interval(IntervalResult(first.current_level))
     again = Procedure(SMALL, 3, cut)
     assert (again.phase, again.trial_number) == ("consent", 17)
-    go_through(again, rng, 2.0)
+    run_participant(again, rng, 2.0)
     assert cut.participant_file(3).read_bytes() == whole.participant_file(3).read_bytes()
     assert len(cut.read_rows(3)) == len(plan_trials(SMALL, 3))
 
 
-def goes_through(folder: str) -> None:
+def run_numbered(folder: str) -> None:
     """Run a participant with answers by trial number, and print each trial."""
     with open_trial_store(Path(folder), SHORT) as store:
         procedure = Procedure(SHORT, 1, store)
@@ -104,7 +104,7 @@ def goes_through(folder: str) -> None:
 
 @pytest.mark.slow
 def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
-    code = "import sys; from test_procedure import goes_through; goes_through(sys.argv[1])"
+    code = "import sys; from test_procedure import run_numbered; run_numbered(sys.argv[1])"
     command = [sys.executable, "-c", code, str(tmp_path / "cut")]
     folder = Path(__file__).parent
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
@@ -115,8 +115,8 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     cut = TrialStore(tmp_path / "cut")
     left = len(cut.read_rows(1))
     assert message <= left < len(plan_trials(SHORT, 1))
-    goes_through(str(tmp_path / "cut"))
-    goes_through(str(tmp_path / "whole"))
+    run_numbered(str(tmp_path / "cut"))
+    run_numbered(str(tmp_path / "whole"))
     assert cut.read_rows(1) == TrialStore(tmp_path / "whole").read_rows(1)
 
 
@@ -132,7 +132,7 @@ def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_p
         True,
         before,
     )
-    go_through(procedure, np.random.default_rng(0), 2.0)
+    run_participant(procedure, np.random.default_rng(0), 2.0)
     counted = [row for row in TrialStore(tmp_path).read_rows(1) if not row.practice]
     assert len(counted) == 3 * (6 + 5 + 2)
 
@@ -163,7 +163,7 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
     with open_trial_store(tmp_path, SMALL) as store:
         with pytest.raises(DrakeTeleopError, match="another process"):
             open_trial_store(tmp_path, SMALL).__enter__()
-        go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
+        run_participant(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
         assert store.trials_table().shape == (3, 12)
         text = store.participant_file(1).read_text()
         for damaged in (text[:-30], text.replace("\n1,", "\n7,"), "trial\nx"):
@@ -209,7 +209,7 @@ def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, h
     task = ContactDetection(trials=2, practice=3, low=low, high=high)
     experiment = Experiment(tasks=[task], conditions=[Condition(name="a")])
     store = TrialStore(tmp_path)
-    go_through(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
+    run_participant(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
     rows, psi = store.read_rows(1), PsiMethod(low, high)
     assert not all(row.correct for row in rows[:3])
     assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]

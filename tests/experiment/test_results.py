@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from test_procedure import SMALL, go_through
+from test_procedure import SMALL, run_participant
 
 from drake_teleop.cli.experiment import next_participant
 from drake_teleop.common.style import Picture
@@ -28,7 +28,7 @@ def test_table_contains_the_true_thresholds(tmp_path):
     experiment = Experiment(tasks=[ContactDetection(trials=40)], conditions=[Condition(name="a")])
     store, rng = TrialStore(tmp_path), np.random.default_rng(2)
     for number in range(1, 6):
-        go_through(Procedure(experiment, number, store), rng, 2.0)
+        run_participant(Procedure(experiment, number, store), rng, 2.0)
     found = [r for r in compute_results(experiment, store) if r.quantity == CONTACT]
     each = [r for r in found if r.participant]
     assert len(each) == 5 and {r.trials for r in each} == {40}
@@ -41,7 +41,7 @@ def test_table_contains_the_true_thresholds(tmp_path):
 def test_folder_contains_table_trials_and_picture(tmp_path):
     store = TrialStore(tmp_path)
     assert write_results(SMALL, store).is_empty()
-    go_through(Procedure(SMALL, 4, store), np.random.default_rng(0), 2.0)
+    run_participant(Procedure(SMALL, 4, store), np.random.default_rng(0), 2.0)
     table = write_results(SMALL, store)
     assert {p.name for p in tmp_path.glob("*.*")} == {"results.csv", "results.png", "trials.csv"}
     share = table.filter(quantity="share of trials done", condition="a").row(0, named=True)
@@ -66,9 +66,9 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
 def test_next_participant_has_trials_left_or_is_new(tmp_path):
     store, trials = TrialStore(tmp_path), len(plan_trials(SMALL, 1))
     assert next_participant(store, trials) == 1
-    go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
+    run_participant(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
     assert next_participant(store, trials) == 2
-    go_through(Procedure(SMALL, 2, store), np.random.default_rng(0), 2.0, most=5)
+    run_participant(Procedure(SMALL, 2, store), np.random.default_rng(0), 2.0, most=5)
     assert (next_participant(store, trials), next_participant(store, trials, 7)) == (2, 7)
 
 

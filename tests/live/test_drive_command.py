@@ -82,7 +82,7 @@ def test_a_drive_is_recorded_and_repeated(page, capsys):
 
 
 @pytest.mark.long
-def test_a_virtual_device_is_the_hand(page, capfd):
+def test_virtual_device_moves_the_hand(page, capfd):
     enough = threading.Event()
 
     def client() -> None:

@@ -78,7 +78,7 @@ def test_closed_page_releases_the_hand_and_completes_the_record(scenario, load, 
     assert len(again.t) == len(log.t)
     np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
 
-    # The next page takes the stylus where it is.
+    # The next page continues from the current pose.
     live.join(2, clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["driver"], frame["state"], frame["inputs"]["held"]) == (2, "running", 1)
@@ -150,7 +150,7 @@ def test_new_scene_starts_a_drive_with_its_own_folder(scenario, load, clock, tmp
 
 @pytest.mark.slow
 def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, monkeypatch):
-    """Neither by a new drive or a reset, nor in a folder with other files."""
+    """A new drive, a reset and a folder with other files keep earlier records."""
     monkeypatch.chdir(tmp_path)
     before: dict[Path, bytes] = {}
     (tmp_path / "mine").mkdir()
@@ -169,7 +169,7 @@ def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, 
     live = make(scenario, load, clock, Path("."))
     assert live.frame()["record"] == str(tmp_path / "drive-5")
     live.close()
-    assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # it never began
+    assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # the drive has not begun
 
 
 def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
@@ -185,7 +185,7 @@ def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("size_bytes", [60_000, 400_000])
 def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):
-    """For the inputs and the log."""
+    """The error is in writing the inputs or the log."""
     with small_disk(tmp_path, size_bytes):
         live = make(scenario, load, clock, tmp_path / "drive")
         live.join(1, clock())

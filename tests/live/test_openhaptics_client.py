@@ -34,7 +34,7 @@ def built(source: Path, program: Path) -> Path:
 
 
 def test_guard_equals_that_of_the_package(tmp_path):
-    """Over slow and fast displacements, silences, NaN and forces beyond the limits."""
+    """Inputs are slow and fast displacements, silences, NaN and forces beyond the limits."""
     random, guard = np.random.default_rng(2), DeviceGuard(DeviceLimits(force=3.3))
     x = np.cumsum(random.normal(size=(3000, 3)) * random.choice([1e-6, 3e-4], (3000, 1)), axis=0)
     commands = random.normal(size=(3000, 3)).cumsum(axis=0) * 0.1

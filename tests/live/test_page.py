@@ -86,7 +86,7 @@ def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_page_drives(page):
+def test_page_controls_a_drive(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
     # Meshcat sets the camera last; its default position has another direction to the right.
     page.until("Math.hypot(...view().place.map((p, k) => p - frame.tool[k])) < 2")

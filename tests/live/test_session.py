@@ -101,7 +101,7 @@ def test_signals_are_continuous_when_inputs_change(driven, scenario):
 @pytest.mark.long
 @pytest.mark.slow
 def test_new_network_and_method_continue_the_state(scenario, load):
-    """In contact, to another channel and back; the rendered wrench cross-fades."""
+    """The channel changes in contact and back; the rendered wrench cross-fades."""
     session = Session(scenario, load)
     now = session.inputs.with_changes({"z": -2900})
     for end, change in ((250, {}), (1050, {"network": 2, "method": 4}), (1400, {"network": 0})):
@@ -376,7 +376,7 @@ def test_incomplete_last_line_is_ignored(tmp_path):
     assert len(INPUT_RANGES) == 22
 
 
-def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):
+def test_weight_scale_is_separate_or_that_of_the_inertia_at_minus_one(scenario, load):
     apart = replace(scenario, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.25)
     assert (
         Inputs.from_scenario(scenario).sigma_weight == -1

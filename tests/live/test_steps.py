@@ -12,7 +12,7 @@ from drake_teleop.live.session import Session, take_short_steps_in_contact
 SHORTEST, TICK = 2.5e-4, 5e-4
 
 
-def a_ball_on_a_spring(max_step: float = TICK) -> Simulator:
+def ball_on_spring(max_step: float = TICK) -> Simulator:
     """Return a ball that falls by 1 mm and bounces; its contact vibrates at 700 Hz."""
     x, v = Variable("x"), Variable("v")
     spring = if_then_else(x < 0.0, -((2 * np.pi * 700.0) ** 2) * x, 0.0)
@@ -36,7 +36,7 @@ def ticks(simulator: Simulator, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_after_a_rejected_step_all_are_short_for_4_ms_and_none_is_rejected():
-    simulator = a_ball_on_a_spring()
+    simulator = ball_on_spring()
     take_short_steps_in_contact(simulator, SHORTEST)
     taken, rejected = ticks(simulator, 160)
     hits = np.flatnonzero(rejected)
@@ -52,14 +52,14 @@ def test_after_a_rejected_step_all_are_short_for_4_ms_and_none_is_rejected():
 
 
 def test_no_step_is_longer_than_the_scenarios_limit():
-    simulator = a_ball_on_a_spring(max_step=1e-4)
+    simulator = ball_on_spring(max_step=1e-4)
     take_short_steps_in_contact(simulator, SHORTEST)
     taken, _ = ticks(simulator, 60)
     assert taken.min() >= 5
 
 
 def test_monitor_does_not_keep_the_simulator_alive():
-    simulator = a_ball_on_a_spring()
+    simulator = ball_on_spring()
     take_short_steps_in_contact(simulator, SHORTEST)
     held = weakref.ref(simulator)
     del simulator

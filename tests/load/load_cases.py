@@ -17,17 +17,17 @@ OFFSETS = np.array([9.1, -1.0, 10.0, 0.43, -0.69, -0.16])
 
 
 def vectors(n: int, largest: float = 10.0):
-    """Strategy: (n,) numbers up to `largest`."""
+    """Return a strategy for (n,) numbers up to `largest`."""
     return arrays(np.float64, n, elements=st.floats(-largest, largest, allow_subnormal=False))
 
 
 def motions():
-    """Strategy: (s, omega, alpha), each (3,)."""
+    """Return a strategy for motions (s, omega, alpha), each (3,)."""
     return st.tuples(vectors(3, 30.0), vectors(3), vectors(3, 50.0))
 
 
 def loads():
-    """Strategy: (10,) phi of bodies that can exist, points and plates included, 0.1 kg and up."""
+    """Return a strategy for (10,) phi of possible bodies from 0.1 kg, also points and plates."""
     bead = np.diag([0.0, 0.0, 0.0, 0.1])
     return arrays(np.float64, (4, 4), elements=st.floats(-1.0, 1.0, allow_subnormal=False)).map(
         lambda root: phi_from_pseudo_inertia(root @ root.T + bead)
@@ -35,7 +35,7 @@ def loads():
 
 
 def rotations():
-    """Strategy: (3, 3) rotation matrices."""
+    """Return a strategy for (3, 3) rotation matrices."""
 
     def from_quaternion(q):
         norm = np.linalg.norm(q)
@@ -52,9 +52,9 @@ def rotations():
 
 
 def rich_motion(samples: int, seed: int = 0):
-    """(s, omega, alpha), each (samples, 3), that excites everything: slow sines, all axes turning.
+    """Return (s, omega, alpha), each (samples, 3): slow sines that rotate about all axes.
 
-    s is not that of a body under gravity; least squares does not mind.
+    s is not that of a body under gravity, which least squares does not require.
     """
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 2.0 * np.pi, samples, endpoint=False)

@@ -1,4 +1,4 @@
-"""Every batch estimator: exact without noise; each does what it is for."""
+"""Batch estimators: exact results without noise, rejection, deviations and intervals."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def record(samples=2000, noise=0.0, seed=0):
     return F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape), *motion
 
 
-def knocks(wrench, seed=0):
-    """Twelve of 30 samples each, 20 N and 1 N m, dying out; (wrench, which samples)."""
+def add_impacts(wrench, seed=0):
+    """Add twelve decaying impacts of 20 N and 1 N m; return the wrench and their samples."""
     wrench, hit = wrench.copy(), np.zeros(len(wrench), bool)
     decay = np.exp(-np.arange(30) / 10.0)[:, None]
     for start in np.random.default_rng(seed).integers(0, len(wrench) - 30, 12):
@@ -90,7 +90,7 @@ def test_noise_is_estimated():
     assert (np.abs(estimate(result) - estimate(given)) / deviations).max() < 0.2
 
 
-def test_noise_of_the_motion_is_not_taken_for_the_wrenchs():
+def test_noise_of_the_wrench_is_estimated_beside_noise_of_the_motion():
     F, s, omega, alpha = record(4000, noise=1.0)
     rng = np.random.default_rng(3)
     arrays = F, s + 0.2 * rng.normal(size=s.shape), omega, alpha + rng.normal(size=s.shape)
@@ -98,11 +98,11 @@ def test_noise_of_the_motion_is_not_taken_for_the_wrenchs():
     np.testing.assert_allclose(result.noise[:3], WRENCH_NOISE[:3], rtol=0.15)
 
 
-def test_robust_fit_does_without_knocks():
+def test_robust_fit_rejects_impacts():
     F, *motion = record(3000, noise=1.0)
     undisturbed = identify_batch(F, *motion, method="robust")
     assert undisturbed.rejected.mean() < 2e-3
-    knocked, hit = knocks(F)
+    knocked, hit = add_impacts(F)
     plain = identify_batch(knocked, *motion, method="whitened")
     robust = identify_batch(knocked, *motion, method="robust")
     assert robust.rejected[hit].all()
@@ -114,7 +114,7 @@ def test_robust_fit_does_without_knocks():
     assert robust.identification.samples == (~robust.rejected).sum()
 
 
-def test_robust_fit_does_without_a_short_contact():
+def test_robust_fit_rejects_a_short_contact():
     F, *motion = record(3000, noise=1.0)
     contact = np.zeros(3000, bool)
     contact[900:1350] = True
@@ -125,8 +125,8 @@ def test_robust_fit_does_without_a_short_contact():
     assert errors.max() < 4.5
 
 
-def test_motion_is_not_rejected_for_a_disturbance():
-    """A delay that nobody took out, in a record that rests three quarters of the time."""
+def test_delayed_motion_is_not_rejected():
+    """The motion has a delay, and the record rests three quarters of the time."""
     F, s, omega, alpha = record(4000, noise=0.3)
     rests = np.tile(np.repeat([False, True, True, True], 250), 4)
     F[rests] = OFFSETS + non_contact_wrench(s[[0]], [0, 0, 0], [0, 0, 0], TOOL)
@@ -139,15 +139,15 @@ def test_motion_is_not_rejected_for_a_disturbance():
     assert late.identification.mass == pytest.approx(TOOL[0], rel=0.05)
 
 
-def test_a_quarter_of_the_samples_doubles_the_deviations():
-    """Where nothing is rejected any more."""
+def test_deviations_double_for_a_quarter_of_the_samples():
+    """The record has no rejected samples."""
     whole = SampleRecord(*record(2000, noise=1.0))
     fit = METHODS["whitened"].fit(whole, EstimatorOptions(NoiseStd(WRENCH_NOISE)))
     assert _std_growth_by_rejection(fit, whole.decimate(4).moments) == pytest.approx(2.0, rel=0.02)
     assert _std_growth_by_rejection(fit, whole.moments) == pytest.approx(1.0)
 
 
-def test_poses_share_a_noise():
+def test_shared_noise_is_equal_for_all_forces_and_all_torques():
     s = static_poses()
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     F = F + WRENCH_NOISE * np.random.default_rng(3).normal(size=F.shape)
@@ -158,18 +158,18 @@ def test_poses_share_a_noise():
     np.testing.assert_allclose(estimate(shared)[:10], estimate(plain)[:10], rtol=1e-6)
 
 
-def test_few_samples_reject_none():
+def test_few_samples_are_not_rejected():
     s = static_poses()[:8]
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     F[3] += 5.0
     assert not identify_batch(F, s, np.zeros(3), np.zeros(3)).rejected.any()
 
 
-def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
+def test_default_is_robust_consistent_and_uses_the_noise_of_the_motion():
     plate = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
     motion = rich_motion(3000)
     rng = np.random.default_rng(8)
-    F, hit = knocks(OFFSETS + non_contact_wrench(*motion, plate))
+    F, hit = add_impacts(OFFSETS + non_contact_wrench(*motion, plate))
     F = F + 0.1 * WRENCH_NOISE * rng.normal(size=F.shape)
     s, omega, alpha = motion
     alpha = alpha + 2.0 * rng.normal(size=alpha.shape)
@@ -185,7 +185,7 @@ def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_negative_mass_is_shown(method):
+def test_negative_mass_is_reported(method):
     F, *motion = record(noise=1.0)
     found = identify_batch(-F, *motion, method=method).identification
     assert found.mass == pytest.approx(-TOOL[0], rel=0.01)
@@ -213,7 +213,7 @@ def test_stated_deviations_hold_with_errors_in_variables():
 @pytest.mark.long
 @pytest.mark.slow
 def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
-    """Of angular accelerations for the most part: in force and torque at once."""
+    """Most noise is that of angular accelerations, which is in force and torque at once."""
     motion, errors = rich_motion(1000), []
     noise = NoiseStd(WRENCH_NOISE, alpha=1.0)
     clean = OFFSETS + non_contact_wrench(*motion, TOOL)
@@ -225,12 +225,12 @@ def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
         deviations = result.identification.standard_deviations
         errors.append((estimate(result) - TRUTH) / deviations)
     scatter = np.std(errors, axis=0)
-    # 150 records tell a standard deviation to 6 %. Without the correlation: 0.3 for some.
+    # 150 records give a standard deviation within 6 %. Without the correlation: 0.3 for some.
     assert scatter.min() > 0.8 and scatter.max() < 1.2
 
 
-def test_consistent_is_the_constrained_total():
-    """With offsets, and noise that correlates the channels."""
+def test_consistent_fit_is_the_constrained_total_fit():
+    """The record has offsets and noise that correlates the channels."""
     plate = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
     motion = rich_motion(1000)
     F = OFFSETS + non_contact_wrench(*motion, plate)
@@ -261,14 +261,14 @@ def test_known_offsets():
     assert (known.identification.offsets == 0.0).all()
     deviations = known.identification.standard_deviations
     assert (deviations[:6] == 0.0).all()
-    # To the rounding of the noise, which is estimated from another residual.
+    # Up to rounding of the noise, which is estimated from another residual.
     assert (deviations[6:] <= 1.001 * free.identification.standard_deviations[6:]).all()
     assert (np.abs(known.identification.phi - TOOL) / deviations[6:]).max() < 4.5
 
 
 @pytest.mark.parametrize("offsets", [True, False])
 @pytest.mark.parametrize("method", ["ordinary", "whitened"])
-def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
+def test_covariance_of_gains_is_the_sum_of_their_effects(method, offsets):
     F, *motion = record(300)
     F -= 0.0 if offsets else OFFSETS
     noise = NoiseStd(1e-6 * WRENCH_NOISE)
@@ -292,7 +292,7 @@ def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
-def test_intervals_hold_with_gains_as_wrong_as_stated(method):
+def test_intervals_cover_the_truth_with_stated_gain_errors(method):
     rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
     exact, *motion = record()
     for seed in range(60):
@@ -305,7 +305,7 @@ def test_intervals_hold_with_gains_as_wrong_as_stated(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_static_poses_say_nothing_of_the_inertia(method):
+def test_static_poses_do_not_determine_the_inertia(method):
     s = record(50)[1]
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     F = F + 0.1 * WRENCH_NOISE * np.random.default_rng(1).normal(size=F.shape)
@@ -317,7 +317,7 @@ def test_static_poses_say_nothing_of_the_inertia(method):
 
 
 @pytest.mark.parametrize("method", ["total", "consistent"])
-def test_noise_is_not_taken_for_excitation(method):
+def test_noise_does_not_count_as_excitation(method):
     s = np.repeat(static_poses(), 100, axis=0)
     rng = np.random.default_rng(2)
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
@@ -353,18 +353,18 @@ def test_order_frame_and_units_do_not_matter(method, rotation, seed, force):
     order = np.random.default_rng(seed).permutation(300)
     shuffled = phi(F[order], [x[order] for x in motion], noise)
     np.testing.assert_allclose(shuffled / scale, expected / scale, rtol=0, atol=1e-7)
-    # Forces in other units: the load is heavier by as much.
+    # Forces in other units scale the load by the same factor.
     other = NoiseStd(force * isotropic, s=0.1, omega=0.01, alpha=1.0)
     scaled = phi(force * F, motion, other) / force
     np.testing.assert_allclose(scaled / scale, expected / scale, rtol=0, atol=1e-6)
-    if method not in ("robust", "consistent"):  # which look at one axis after the other
+    if method not in ("robust", "consistent"):  # these methods treat each axis separately
         turned = (F.reshape(-1, 2, 3) @ rotation.T).reshape(-1, 6)
         back = phi(turned, [x @ rotation.T for x in motion], noise)
         back = transform_phi(back, rotation.T, np.zeros(3))
         np.testing.assert_allclose(back / scale, expected / scale, rtol=0, atol=1e-6)
 
 
-def test_a_file_of_each(tmp_path):
+def test_result_of_each_method_is_saved_and_loaded(tmp_path):
     for method in METHODS:
         result = identify_batch(*record(200, noise=1.0), method=method).identification
         result.save(tmp_path / "identification.json")
@@ -374,20 +374,20 @@ def test_a_file_of_each(tmp_path):
 
 
 @pytest.mark.parametrize("what", ["complex", "masked"])
-def test_no_part_of_a_number_is_lost(what):
+def test_complex_and_masked_numbers_are_refused(what):
     wrench, *motion = record(50, noise=1.0)
     other = wrench + 0j if what == "complex" else np.ma.masked_greater(wrench, 1.0)
     with pytest.raises(DrakeTeleopError, match=rf"wrench: holds no numbers \({what}\)"):
         identify_batch(other, *motion)
     with pytest.raises(DrakeTeleopError, match=rf"t: holds no numbers \({what}\)"):
         SimulationResult(other[:, 0], {}, [])
-    kept = identify_batch(np.ma.array(wrench), *motion)  # of which nothing is masked
+    kept = identify_batch(np.ma.array(wrench), *motion)  # no element is masked
     np.testing.assert_array_equal(
         kept.identification.phi, identify_batch(wrench, *motion).identification.phi
     )
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     arrays = record(20)
     with pytest.raises(DrakeTeleopError, match=r"^method: there is no estimator 'guess'"):
         identify_batch(*arrays, method="guess")
@@ -414,7 +414,7 @@ def utias():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_tool_without_noise(utias, method):
+def test_load_of_each_workshop_tool_is_exact_without_noise(utias, method):
     for file in sorted(TOOLS.glob("*.npz")):
         *arrays, phi = utias.load(file)
         found = identify_batch(*arrays, method=method).identification.phi
@@ -425,7 +425,7 @@ def test_every_tool_without_noise(utias, method):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_utias_protocol(utias):
+def test_workshop_tools_are_identified_with_the_published_protocol(utias):
     for level, methods in utias.run(TOOLS, seeds=3).items():
         *errors, consistent = methods["consistent"]
         assert (np.array(errors) <= utias.TARGETS[level][:3]).all(), (level, errors)
@@ -433,8 +433,8 @@ def test_utias_protocol(utias):
         assert (np.array(errors[1:]) < np.array(methods["ordinary"][1:3]) / 2.5).all()
 
 
-def test_intervals_hold_when_offsets_wander():
-    """40 records whose low-frequency noise is the walk of the offsets for the most part."""
+def test_intervals_cover_the_truth_with_drifting_offsets():
+    """Drift of the offsets causes most of the low-frequency noise in 40 records."""
     motion = rich_motion(1500)
     clean = non_contact_wrench(*motion, TOOL)
     steps = WRENCH_NOISE / 120
@@ -457,8 +457,8 @@ def test_intervals_hold_when_offsets_wander():
     assert 0.92 < held[1.0] < 0.98
 
 
-def test_the_covariance_of_wandering_offsets_is_a_double_sum():
-    """Against the covariance min(i, j) of a random walk; with a rejected sample."""
+def test_covariance_of_drifting_offsets_is_a_double_sum():
+    """Compare with the covariance min(i, j) of a random walk, with a rejected sample."""
     F, *motion = record(60, noise=1.0)
     F[20, 0] += 1e3
     steps = np.array([0.3, 0.1, 0.2, 0.01, 0.02, 0.005, 0.1, 0.2, 0.1, 0.3, 1.0, 2.0])
@@ -470,7 +470,7 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     assert not kept[20]
     count = np.arange(60.0)[kept]
     walked = np.minimum(count[:, None], count)
-    # What steps of s and alpha do to the wrench of this load.
+    # Effect of steps of s and alpha on the wrench of this load.
     found = with_walk.identification.phi
     still, units = np.zeros((3, 3)), np.eye(3)
     by_s, by_alpha = (
@@ -488,6 +488,6 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     np.testing.assert_allclose(added, inverse @ expected @ inverse, rtol=1e-6, atol=1e-12)
 
 
-def test_a_negative_walk_is_refused():
+def test_negative_random_walk_is_refused():
     with pytest.raises(DrakeTeleopError, match=r"noise\.walk: has the negative value -"):
         NoiseStd(walk=[-1.0] * 12)

@@ -1,4 +1,4 @@
-"""Noticing another load online: what is told apart from what, and what is then known."""
+"""Online detection of a changed load, its distinction from contact, and its identification."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def share(phi, whole):
     return phi[0] / whole[0] - 1.0
 
 
-def test_the_motion_of_the_benchmark_is_that_of_a_body(bench):
-    """alpha is the derivative of omega, and the vertical turns against the body."""
+def test_motion_of_the_benchmark_is_a_body_motion(bench):
+    """alpha is the derivative of omega; the vertical rotates against the body."""
     _, (s, omega, alpha), up = bench.motion(3)
     change = np.gradient(omega, bench.PERIOD, axis=0)[1:-1]
     np.testing.assert_allclose(change, alpha[1:-1], atol=1e-3 * np.abs(alpha).max())
@@ -56,15 +56,15 @@ def test_the_motion_of_the_benchmark_is_that_of_a_body(bench):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_free_motion_is_no_change(bench, tool):
+def test_free_motion_is_not_a_load_change(bench, tool):
     for seed in SEEDS:
         states = bench.monitor("JR3", tool).watch(*bench.record("JR3", seed))
         assert states.max() == KNOWN
 
 
 @pytest.mark.parametrize("kind", ["grasp", "release"])
-def test_an_object_is_noticed_and_known(bench, tool, kind):
-    """At the instant of the alarm, as a change within half a second, its mass within 1 %."""
+def test_object_is_detected_and_identified(bench, tool, kind):
+    """The alarm takes under 50 ms, the change under 0.5 s; the mass is within 1 %."""
     full = bench.TOOL + bench.OBJECT
     before = tool if kind == "grasp" else bench.known("JR3", full)
     for seed in SEEDS:
@@ -81,11 +81,11 @@ def test_an_object_is_noticed_and_known(bench, tool, kind):
         found = load_of_object(*pair)
         error = np.concatenate([[share(found.phi, bench.OBJECT)], (found.phi - bench.OBJECT)[1:4]])
         assert abs(error[0]) < 0.01
-        # The stated uncertainty covers it: covariances add.
+        # Covariances add, so the stated uncertainty covers the error.
         assert (np.abs(error[1:]) < 4.5 * found.standard_deviations[7:10]).all()
         assert abs(error[0]) * 0.8 < 4.5 * found.standard_deviations[6]
         assert (np.abs(monitor.load.offsets - bench.OFFSETS) < 0.2).all()
-        # What the fit leaves is the noise of a sample: of the force at least the sensor's.
+        # The residual is the noise of a sample: for the force at least that of the sensor.
         assert (monitor.load.residual_rms[:3] > 0.2).all()
         assert (monitor.load.residual_rms[:3] < 1.2).all()
 
@@ -95,7 +95,7 @@ def test_an_ideal_sensor_finds_the_object_exactly_and_then_the_next(bench):
     states = monitor.watch(*bench.record("ideal", 1, "grasp"))
     assert states[-1] == IDENTIFIED
     np.testing.assert_allclose(monitor.load.phi, bench.TOOL + bench.OBJECT, atol=1e-9)
-    # With the object known, putting it down is a change again.
+    # With an identified object, its release is another change.
     full = bench.TOOL + bench.OBJECT
     again = monitor.watch(*bench.record("ideal", 2, "release", full))
     assert again[: int(bench.EVENT / bench.PERIOD)].max() == IDENTIFIED
@@ -106,7 +106,7 @@ def test_an_ideal_sensor_finds_the_object_exactly_and_then_the_next(bench):
 
 @pytest.mark.parametrize("sensor", ["JR3", "ideal"])
 @pytest.mark.parametrize("kind", ["knock", "push", "hand", "along g"])
-def test_a_contact_is_never_identified_and_forgotten_when_it_ends(bench, sensor, kind):
+def test_contact_is_never_identified_as_a_load_and_is_reset_at_its_end(bench, sensor, kind):
     before = bench.known(sensor)
     for seed in SEEDS:
         monitor = bench.monitor(sensor, before)
@@ -118,8 +118,8 @@ def test_a_contact_is_never_identified_and_forgotten_when_it_ends(bench, sensor,
             assert states.max() < CHANGED
 
 
-def test_a_vertical_push_at_rest_is_a_weight_until_the_tool_moves(bench, tool):
-    """Nothing can tell them apart while nothing moves; the push does not follow the motion."""
+def test_vertical_push_at_rest_counts_as_weight_until_the_tool_moves(bench, tool):
+    """Push and weight are equal at rest; in motion the push has a constant direction in S."""
     t, moving, up = bench.motion(5)
     still = [np.tile(x[:1] * keep, (len(t), 1)) for x, keep in zip(moving, (1, 0, 0), strict=True)]
     still[0] = np.tile(9.81 * up[:1], (len(t), 1))
@@ -140,10 +140,10 @@ def test_a_vertical_push_at_rest_is_a_weight_until_the_tool_moves(bench, tool):
         assert np.bincount(states[1000:]).argmax() == expected
 
 
-def test_grasped_at_rest_and_lifted(bench, tool):
-    """Another load at once; known only when it moves.
+def test_object_grasped_at_rest_is_identified_in_motion(bench, tool):
+    """A change is detected at once; the load is identified only in motion.
 
-    Noise of alpha shrinks the inertias at rest. When it moves they do not fit: all starts anew.
+    Noise of alpha biases the inertias at rest. In motion they do not fit, and the fit restarts.
     """
     t, moving, up = bench.motion(6)
     still = [np.tile(x[:1], (len(t), 1)) for x in (9.81 * up, 0 * up, 0 * up)]
@@ -164,8 +164,8 @@ def test_grasped_at_rest_and_lifted(bench, tool):
     assert monitor.load.mass - tool.mass == pytest.approx(0.8, rel=0.01)
 
 
-def test_inertias_that_noise_has_shrunk_are_doubted(bench, tool):
-    """In a slow motion alpha is mostly noise: the deviations say that inertias are too small."""
+def test_load_is_identified_in_slow_motion_with_noisy_alpha(bench, tool):
+    """Noise dominates alpha in slow motion, and makes estimated inertias too small."""
     t, clean, up = bench.motion(8)
     turn = 0.6 * np.sin(0.8 * t)
     rate, change = 0.48 * np.cos(0.8 * t), -0.384 * np.sin(0.8 * t)
@@ -188,7 +188,7 @@ def test_inertias_that_noise_has_shrunk_are_doubted(bench, tool):
 
 @pytest.mark.slow
 def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool):
-    """AR(1) noise with a memory of 2 ms, much louder in the long run than from sample to sample."""
+    """AR(1) noise with a memory of 2 ms: the long-run variance is far above that of samples."""
     pole = 0.6
     for seed in SEEDS:
         rng, (t, clean, _) = np.random.default_rng(seed), bench.motion(seed)
@@ -200,7 +200,7 @@ def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool
 
 
 def test_errors_of_gain_and_cross_talk_are_no_change_if_stated(bench, tool):
-    """The load was identified in the same sensor's units, but in another motion."""
+    """The load was identified with the same sensor, but in another motion."""
     noise = NoiseStd(np.repeat([0.25, 0.012], 3), 0.06, 0.0, 1.5)
     alarms = {0.0: 0, 0.01: 0}
     for seed in SEEDS:
@@ -222,7 +222,7 @@ def test_errors_of_gain_and_cross_talk_are_no_change_if_stated(bench, tool):
 
 
 def test_the_new_load_is_the_least_squares_solution_with_the_known_prior(bench, tool):
-    """By numpy, from the means of the same blocks."""
+    """The reference is a numpy solution from the means of the same blocks."""
     noise = np.repeat([0.25, 0.012], 3)
     monitor = bench.Monitor(tool, noise, np.zeros(9), 1e-3, offset_drift=np.full(6, 0.01))
     _, clean, _ = bench.motion(4)
@@ -264,8 +264,8 @@ def test_single_samples_give_the_same_states_as_a_log(bench, tool):
     np.testing.assert_array_equal(single.memory, at_once.memory)
 
 
-def test_what_the_known_load_leaves_open_is_open(bench, tool):
-    """Inertias that were not determined may be anything: no alarm, and a file that can be saved."""
+def test_undetermined_inertias_raise_no_alarm(bench, tool):
+    """Undetermined inertias have no finite variance: no alarm, and the result can be saved."""
     covariance = tool.covariance.copy()
     covariance[10:, :] = covariance[:, 10:] = 0.0
     covariance[range(10, 16), range(10, 16)] = np.inf
@@ -278,8 +278,8 @@ def test_what_the_known_load_leaves_open_is_open(bench, tool):
     assert np.isfinite(monitor.load.covariance).all()
 
 
-def test_a_slower_log(bench, tool):
-    """At 100 Hz a block is two samples."""
+def test_two_samples_per_block_detect_the_change(bench, tool):
+    """A block has two samples at 100 Hz."""
     rows = [x[::10] for x in bench.record("JR3", 3, "grasp")]
     std = [np.repeat(x, 3) for x in bench.SENSORS["JR3"]]
     states = bench.Monitor(tool, *std, 1e-2).watch(*rows)
@@ -299,7 +299,7 @@ def test_a_slower_log(bench, tool):
         ({"offset_drift": np.full(6, np.nan)}, "offset_drift: is not finite"),
     ],
 )
-def test_bad_input(bench, tool, change, words):
+def test_invalid_input_raises(bench, tool, change, words):
     good = {"wrench_std": np.ones(6), "motion_std": np.zeros(9), "period": 1e-3}
     with pytest.raises(DrakeTeleopError, match=words):
         bench.Monitor(tool, **(good | change))

@@ -1,4 +1,4 @@
-"""The scaling law and what must follow from it."""
+"""Scaling law of the load and its consequences."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def named(*values):
 @pytest.mark.long
 @pytest.mark.slow
 @given(vectors(6, 100.0), motions(), loads(), loads(), scales, scales, scales)
-def test_the_law_as_the_paper_draws_it(F, motion, gripper, thing, sigma_gr, sigma_obj, gamma):
+def test_law_equals_that_of_the_paper(F, motion, gripper, thing, sigma_gr, sigma_obj, gamma):
     V = regressor(*motion)
     F_c = F - OFFSETS - V @ (gripper + thing)
     expected = gamma * F_c + V @ (sigma_gr * gripper + sigma_obj * thing)
@@ -89,19 +89,19 @@ def test_one_sample_and_many_are_the_same_to_the_last_bit():
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
-def test_scales_are_not_negative(name, value):
+def test_negative_scales_raise(name, value):
     values = {**named(1.0, 1.0, 1.0), name: value}
     with pytest.raises(DrakeTeleopError, match=f"^{name}: .* is not a finite number >= 0"):
         scaled_wrench(np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **values)
 
 
 @pytest.mark.parametrize("eta", [-0.01, 1.01, np.nan])
-def test_eta_is_a_share(eta):
+def test_eta_outside_0_to_1_raises(eta):
     with pytest.raises(DrakeTeleopError, match=r"^eta: .* is outside 0 to 1"):
         scales_from_eta(eta)
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     with pytest.raises(DrakeTeleopError, match=r"^wrench: has shape \(5,\)"):
         contact_wrench(np.zeros(5), OFFSETS, *np.zeros((3, 3)), TOOL)
     with pytest.raises(DrakeTeleopError, match=r"^offsets: is not finite"):
@@ -128,7 +128,7 @@ def test_weight_and_inertia_have_separate_scales(F, motion, gripper, thing, g, w
 
 
 @pytest.mark.parametrize("given", ["sigma_weight", "sigma_inertia"])
-def test_the_other_share_is_that_of_each_part(given):
+def test_other_share_is_the_remainder_of_each_part(given):
     motion, thing, g = rich_motion(5), 0.1 * TOOL, np.tile(GRAVITY, (5, 1))
     rest, F = np.zeros((5, 3)), np.ones((5, 6))
     free = {"sigma_gripper": 0.3, "sigma_object": 0.8, "gamma": 1.5, "gravity": GRAVITY}

@@ -1,4 +1,4 @@
-"""The semidefinite program: exact where it should be, consistent always."""
+"""Least squares over physically consistent loads by a semidefinite program."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POINT = phi_from_mass_com_inertia(1.0, [0, 0.01, 0.1], np.zeros((3, 3)))
 WRENCH_NOISE = np.array([0.1] * 3 + [0.005] * 3)
 
 
-def fit(phi, noise=0.0, seed=0):
+def normal_form_of(phi, noise=0.0, seed=0):
     motion = rich_motion(500)
     F = OFFSETS + non_contact_wrench(*motion, phi)
     F = F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape)
@@ -33,8 +33,8 @@ def fit(phi, noise=0.0, seed=0):
 
 
 def inconsistent_fit(phi, noise, number=0):
-    """Of the fits in noise, one for each seed, the first that no body can have."""
-    fits = (fit(phi, noise, seed) for seed in range(100))
+    """Return the first fit to noisy data, over seeds, that is no possible body."""
+    fits = (normal_form_of(phi, noise, seed) for seed in range(100))
     impossible = (form for form in fits if not is_physically_consistent(form.theta[6:]))
     return [next(impossible) for _ in range(number + 1)][-1]
 
@@ -43,14 +43,14 @@ def consistent(form):
     return consistent_least_squares(form.gram, form.right, form.theta)
 
 
-def test_a_consistent_fit_is_returned_as_it_is():
-    form = fit(TOOL, noise=0.1)
+def test_consistent_fit_is_unchanged():
+    form = normal_form_of(TOOL, noise=0.1)
     np.testing.assert_array_equal(consistent(form), form.theta)
 
 
 @pytest.mark.parametrize("phi", [ROD, PLATE, POINT])
-def test_the_edge_of_consistency_without_noise(phi):
-    # A little noise, so that least squares is not consistent and the program is solved.
+def test_limiting_consistent_load_is_exact_without_noise(phi):
+    # A little noise makes least squares inconsistent, so that the program is solved.
     form = inconsistent_fit(phi, 1e-6)
     found = consistent(form)[6:]
     assert is_physically_consistent(found)
@@ -59,20 +59,20 @@ def test_the_edge_of_consistency_without_noise(phi):
 
 
 @pytest.mark.parametrize("phi", [TOOL, ROD, CENTRED])
-def test_the_unit_of_length_plays_no_part(phi):
+def test_result_is_independent_of_the_unit_of_length(phi):
     form = inconsistent_fit(phi, 1e-6 if phi is not TOOL else 100.0)
     metres = np.repeat([1.0, 1e-3, 1e-6], [7, 3, 6])  # of the parameters' units, in mm
     found = consistent_least_squares(
         np.outer(metres, metres) * form.gram, metres * form.right, form.theta / metres
     )
     expected = consistent(form)
-    assert np.abs(expected - form.theta)[10:].max() > 0.0  # the program is solved
+    assert np.abs(expected - form.theta)[10:].max() > 0.0  # fails unless the program is solved
     size = np.linalg.norm(expected[6:])
     np.testing.assert_allclose((found * metres)[6:], expected[6:], rtol=1e-9, atol=1e-11 * size)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_best_of_the_consistent(seed):
+def test_result_has_the_least_cost_of_all_consistent_loads(seed):
     form = inconsistent_fit(PLATE, 10.0, number=seed)
     found = consistent(form)
     assert is_physically_consistent(found[6:])
@@ -80,7 +80,7 @@ def test_the_best_of_the_consistent(seed):
     def cost(theta):
         return theta @ form.gram @ theta - 2.0 * form.right @ theta
 
-    # Optimal: no small step towards another consistent load is better, the truth among them.
+    # Optimality: small steps towards other consistent loads, including the true one, cost more.
     rng = np.random.default_rng(seed)
     for _ in range(50):
         other = found.copy()

@@ -1,4 +1,4 @@
-"""Detection of contact: closed forms, slow twins of the kernels, and what a detector must obey."""
+"""Detection of contact: closed forms, reference loops of the kernels, and its requirements."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ STILL = (np.array([0.0, 0.0, 9.81]), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 def white(rho: float = 0.0) -> NoiseFloor:
-    """A floor of white channels, at any motion the same."""
+    """Return a noise floor of white channels that is independent of the motion."""
     return NoiseFloor(NOISE, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.full(6, rho))
 
 
@@ -54,7 +54,7 @@ def at_rest(samples: int):
 
 
 def swing(samples: int, seed: int, largest: float = 5.0):
-    """(s, omega, alpha, a) of sines under gravity, slow and fast by turns."""
+    """Return (s, omega, alpha, a) of alternately slow and fast sines under gravity."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) * 1e-3
     burst = 0.5 * (1.0 + np.sin(0.9 * t))[:, None]
@@ -89,7 +89,7 @@ def test_faster_motion_never_lowers_the_floor(a, factor):
     assert (floor.noise_std_along(s, rest, rest, factor * a[None]) >= slow).all()
 
 
-def test_a_held_acceleration_fades():
+def test_excitation_of_a_held_acceleration_fades():
     floor = NoiseFloor(NOISE, np.zeros((16, 16)), np.ones((6, 2)), np.eye(6), np.zeros(6), fade=0.5)
     a = np.zeros((4, 3))
     a[1, 0] = 2.0
@@ -101,7 +101,7 @@ def test_a_held_acceleration_fades():
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_a_planted_floor_is_found(seed):
+def test_known_noise_floor_is_estimated(seed):
     rng, samples = np.random.default_rng(seed), 40_000
     motion = swing(samples, seed)
     growth = np.repeat([[0.08, 0.05], [0.004, 0.002]], 3, axis=0)
@@ -115,31 +115,31 @@ def test_a_planted_floor_is_found(seed):
     np.testing.assert_allclose(found.rho, 0.0, atol=0.03)
     np.testing.assert_allclose(found.sum_widths, 1.0, atol=0.1)
     level = statistics_of_log(found, contact, *motion)[:, 0]
-    # Its square is chi-squared, slow or fast.
+    # Its square is chi-squared in slow and in fast motion.
     for rows in (np.linalg.norm(motion[3], axis=1) < 2.0, np.linalg.norm(motion[3], axis=1) > 5.0):
         assert (level[rows] ** 2 > chi2.isf(0.01, 6)).mean() == pytest.approx(0.01, abs=0.004)
 
 
-def test_coloured_noise_is_made_white():
+def test_coloured_noise_is_whitened():
     rng, rho = np.random.default_rng(5), 0.9
     noise = rng.normal(size=(50_000, 6)) * NOISE
     for k in range(1, len(noise)):
         noise[k] = rho * noise[k - 1] + math.sqrt(1 - rho**2) * noise[k]
     found = fit_noise_floor(noise, *at_rest(len(noise)), np.zeros((16, 16)))
     np.testing.assert_allclose(found.rho, rho, atol=0.01)
-    # The maximum of the likelihood ratios is then as rarely large as in white noise.
+    # The maximum of the likelihood ratios exceeds its threshold as rarely as in white noise.
     glr = statistics_of_log(found, noise, *at_rest(len(noise)))[:, 2]
     assert (glr > 6.2).mean() < 1e-4
     assert (statistics_of_log(white(), noise, *at_rest(len(noise)))[:, 2] > 6.2).mean() > 0.1
 
 
-def test_a_record_without_noise_has_a_floor_nevertheless():
+def test_record_without_noise_has_a_positive_floor():
     found = fit_noise_floor(np.zeros((200, 6)), *at_rest(200), np.zeros((16, 16)))
     np.testing.assert_allclose(found.noise, [1e-3] * 3 + [1e-4] * 3)
 
 
-def test_a_slow_error_does_not_set_the_threshold_of_quick_contacts():
-    """Half a standard deviation that swings within seconds: long sums are full of it."""
+def test_slow_error_does_not_raise_the_threshold_of_quick_contacts():
+    """An oscillation of half a standard deviation within seconds dominates long sums."""
     rng, n = np.random.default_rng(6), 60_000
     slow = 0.7 * np.sin(np.arange(n)[:, None] * 1e-3 * rng.uniform(1.0, 3.0, 6))
     noise = (rng.normal(size=(n, 6)) + slow) * NOISE
@@ -160,7 +160,7 @@ def test_a_slow_error_does_not_set_the_threshold_of_quick_contacts():
     assert noticed[1] < 0.5
 
 
-def test_what_a_record_left_open_counts_as_natural():
+def test_undetermined_parameters_have_their_natural_scale():
     covariance = np.diag(np.r_[np.full(6, 0.01), np.full(4, 1e-6), np.full(6, np.inf)])
     P = limit_covariance(TOOL, covariance)
     np.testing.assert_allclose(np.diag(P)[10:], natural_scales(TOOL)[10:] ** 2)
@@ -177,7 +177,7 @@ def test_what_a_record_left_open_counts_as_natural():
     st.floats(0.1, 2.0),
 )
 @settings(max_examples=40)
-def test_statistics_against_their_definitions(contact, rho, slack):
+def test_statistics_equal_their_definitions(contact, rho, slack):
     z = contact / NOISE
     e = z.copy()
     e[1:] = (z[1:] - rho * z[:-1]) / math.sqrt(1.0 - rho**2)
@@ -193,7 +193,7 @@ def test_statistics_against_their_definitions(contact, rho, slack):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
 
 
-def test_the_window_of_the_likelihood_ratio_is_forgotten():
+def test_window_of_the_likelihood_ratio_is_finite():
     contact = np.zeros((3 * MAX_SUMMED_SAMPLES, 6))
     contact[10] = 100.0 * NOISE
     glr = statistics_of_log(white(), contact, *at_rest(len(contact)))[:, 2]
@@ -212,8 +212,8 @@ def test_correlated_channels_have_mahalanobis_distance(z):
     np.testing.assert_allclose(level**2, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
-    """A push of one standard deviation: the sums need some 20 samples, the level far more."""
+def test_sums_detect_a_weak_contact_sooner_at_equal_false_alarms():
+    """A push of one standard deviation: sums need about 20 samples, the level far more."""
 
     def found(x):
         return statistics_of_log(white(), x, *at_rest(len(x)), slack=0.5)
@@ -239,7 +239,7 @@ def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
 @pytest.mark.slow
 @given(st.sampled_from(STATISTIC_NAMES), st.integers(0, 100))
 @settings(max_examples=20)
-def test_sample_by_sample_is_as_in_one_go(statistic, seed):
+def test_sample_by_sample_equals_a_log_in_one_call(statistic, seed):
     rng = np.random.default_rng(seed)
     contact = rng.normal(size=(200, 6)) * NOISE
     contact[60:120, 1] += 10.0 * NOISE[1]
@@ -255,7 +255,7 @@ def test_sample_by_sample_is_as_in_one_go(statistic, seed):
 
 
 @pytest.mark.parametrize("statistic", STATISTIC_NAMES)
-def test_a_contact_that_flickers_is_one_and_ends_after_the_hold(statistic):
+def test_interrupted_contact_is_one_and_ends_after_the_hold(statistic):
     contact = np.zeros((400, 6))
     contact[100:200:5, 2] = 12.0 * NOISE[2]
     flags = ContactDetector(white(), 8.0, statistic=statistic, hold=20).detect(
@@ -264,8 +264,8 @@ def test_a_contact_that_flickers_is_one_and_ends_after_the_hold(statistic):
     np.testing.assert_array_equal(np.flatnonzero(flags), np.arange(100, 195 + 21))
 
 
-def test_a_weak_force_keeps_a_contact_whatever_the_hold():
-    """Two standard deviations are none in one sample, and plain in the longest window, 64."""
+def test_weak_force_keeps_a_contact_for_any_hold():
+    """Two standard deviations are invisible in one sample, but clear in the longest window, 64."""
     contact = np.zeros((2500, 6))
     contact[100:200, 2], contact[200:1500, 2] = 30.0 * NOISE[2], 2.0 * NOISE[2]
     for hold in (100, 300):
@@ -273,7 +273,7 @@ def test_a_weak_force_keeps_a_contact_whatever_the_hold():
         assert flags[100:1500].all() and not flags[1500 + 64 + hold :].any()
 
 
-def test_a_long_contact_is_over_at_once_and_the_next_is_noticed():
+def test_long_contact_ends_at_once_and_the_next_is_detected():
     contact = np.zeros((20_000, 6))
     contact[100:15_000, 0] = contact[15_100:, 0] = 30.0 * NOISE[0]
     flags = ContactDetector(white(), 8.0, hold=20).detect(contact, *at_rest(len(contact)))
@@ -281,8 +281,8 @@ def test_a_long_contact_is_over_at_once_and_the_next_is_noticed():
 
 
 @pytest.mark.parametrize("statistic", ["cusum", "glr"])
-def test_a_weak_contact_is_one_contact(statistic):
-    """Two standard deviations, which only sums notice: the flag must not go on and off."""
+def test_weak_contact_is_not_interrupted(statistic):
+    """Two standard deviations, which only sums detect: the flag must be constant."""
     rng = np.random.default_rng(3)
     noise = rng.normal(size=(6000, 6)) * NOISE
     contact = noise.copy()
@@ -298,8 +298,8 @@ def test_a_weak_contact_is_one_contact(statistic):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_drift_is_no_contact_and_a_push_on_top_of_it_is(seed):
-    """1.5 standard deviations within 100 s, twice what the sensor of the station does."""
+def test_only_the_push_is_contact_during_drift(seed):
+    """A drift of 1.5 standard deviations in 100 s, twice that of the station's sensor."""
     rng, n = np.random.default_rng(seed), 100_000
     wrench = rng.normal(size=(n, 6)) * NOISE
     quiet = wrench[:20_000]
@@ -318,8 +318,8 @@ def test_drift_is_no_contact_and_a_push_on_top_of_it_is(seed):
     assert stays[:-1000].mean() > 0.2
 
 
-def test_fast_motion_is_no_contact_and_a_push_in_it_is():
-    """A load that is 1 % too light in the estimate, late by 2 ms: eliminated, but not quite."""
+def test_only_the_push_is_contact_in_fast_motion():
+    """The estimated load is 1 % too light and 2 ms late, so that elimination leaves a residual."""
     samples = 40_000
     s, omega, alpha, a = swing(samples, 1, 8.0)
     rng = np.random.default_rng(9)
@@ -347,11 +347,11 @@ def test_fast_motion_is_no_contact_and_a_push_in_it_is():
         assert (statistics_of_log(f, *test)[:, 0] >= threshold).mean() < 0.005
         pushed = statistics_of_log(f, test[0] + push, *test[1:])[:, 0]
         seen.append((pushed[slow] >= threshold).mean())
-    # With one floor for all motions the threshold is that of the fastest.
+    # A single floor for all motions has the threshold of the fastest one.
     assert seen[0] > 0.5 > 5.0 * seen[1]
 
 
-def test_an_update_is_one_sample():
+def test_each_update_counts_one_sample():
     memory, floor = np.zeros(MEMORY_SIZE), white(0.5)
     for count in (1.0, 2.0):
         update_statistics(
@@ -360,7 +360,7 @@ def test_an_update_is_one_sample():
         assert memory[0] == count
 
 
-# How good a detector is
+# Quality of a detector
 
 
 @given(
@@ -382,14 +382,14 @@ def test_auc_of_two_normals():
 
 
 @given(arrays(np.float64, st.integers(1, 50), elements=st.floats(-9, 9)), st.floats(0.0, 0.9999))
-def test_a_threshold_from_free_motion_is_the_least_that_holds(free, share):
+def test_threshold_is_the_least_for_a_false_alarm_rate(free, share):
     threshold = free_threshold(free, share)
     assert (free >= threshold).mean() <= share
     assert (free >= np.nextafter(threshold, -np.inf)).mean() > share
     assert free_threshold(free, 1.0) == -math.inf
 
 
-# What a contact says about itself
+# Direction and place of a contact
 
 
 @given(vectors(3), vectors(3, 0.5), st.floats(-0.2, 0.2))
@@ -409,10 +409,10 @@ def test_a_wrench_without_force_has_no_axis():
     assert np.isnan(central_axis_of_wrenches(np.zeros(6))[1]).all()
 
 
-# Bad input
+# Invalid input
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     with pytest.raises(DrakeTeleopError, match=r"statistic.*not a statistic.*level, cusum, glr"):
         ContactDetector(white(), 5.0, statistic="sum")
     with pytest.raises(DrakeTeleopError, match="threshold"):

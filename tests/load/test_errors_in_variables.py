@@ -21,8 +21,8 @@ def benchmark():
     return module
 
 
-def test_the_motion_is_that_of_a_body(benchmark):
-    """alpha is the derivative of omega, and turning s with the body leaves gravity in the mean."""
+def test_motion_is_a_body_motion(benchmark):
+    """alpha is the derivative of omega, and rotating s with the body gives gravity on average."""
     s, omega, alpha = benchmark.motion()
     change = np.gradient(omega, 1 / benchmark.RATE, axis=0)[1:-1]
     np.testing.assert_allclose(change, alpha[1:-1], atol=0.01 * np.abs(alpha).max())
@@ -33,13 +33,13 @@ def test_the_motion_is_that_of_a_body(benchmark):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["JR3", "UTIAS High"])
-def test_total_least_squares_and_instruments_take_out_the_bias(benchmark, level):
+def test_total_least_squares_and_instruments_remove_the_bias(benchmark, level):
     figures = benchmark.summary(level, benchmark.study(level, 20))
     assert {"I_xx", "I_yy", "I_zz"} <= set(figures["biased"])
-    # Scatter of 20 records: its own is 16 %, and this is the largest of 16 parameters.
+    # Scatter of 20 records: that of one parameter is 16 %, and this is the largest of 16.
     for name in ("RIV", "RTLS"):
         assert figures[name]["scatter_over_bound_max"] < 1.7
-        # A fifth of the bias, or of its own scatter what 20 records cannot tell from none.
+        # A fifth of the bias, or the part of the scatter that 20 records cannot resolve.
         ratio = np.array(figures[name]["bias_over_rls"])
         own = np.array(figures[name]["bias_over_own_standard_error"])
         assert ((ratio <= 0.2) | (own <= 3.0)).all()

@@ -1,4 +1,4 @@
-"""Gripper and object: the difference, its covariance, its consistency, Eq. (14)."""
+"""Load of gripper and object: difference, covariance and consistency, Eq. (14)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.0
 NOISE = np.array([0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
 
 
-def recorded(phi: np.ndarray, seed: int, samples: int = 400, noise: float = 1.0) -> Identification:
+def estimate(phi: np.ndarray, seed: int, samples: int = 400, noise: float = 1.0) -> Identification:
     rng = np.random.default_rng(seed)
     s, omega, alpha = (rng.normal(size=(samples, 3)) * size for size in (9.0, 2.0, 15.0))
     wrench = non_contact_wrench(s, omega, alpha, phi) + noise * NOISE * rng.normal(
@@ -28,7 +28,7 @@ def recorded(phi: np.ndarray, seed: int, samples: int = 400, noise: float = 1.0)
 
 
 def test_the_difference_has_the_object_and_the_sum_of_the_covariances() -> None:
-    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
     found = load_of_object(total, gripper)
     assert np.abs((found.phi - OBJECT) / found.standard_deviations[6:]).max() < 4
     expected = total.covariance[6:, 6:] + gripper.covariance[6:, 6:]
@@ -37,82 +37,82 @@ def test_the_difference_has_the_object_and_the_sum_of_the_covariances() -> None:
     assert found.identifiable.all() and found.physically_consistent
 
 
-def test_its_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_have_the_stated_covariance() -> None:
     scores = []
     for seed in range(60):
         found = load_of_object(
-            recorded(GRIPPER + OBJECT, 2 * seed), recorded(GRIPPER, 2 * seed + 1)
+            estimate(GRIPPER + OBJECT, 2 * seed), estimate(GRIPPER, 2 * seed + 1)
         )
         scores.append((found.phi - OBJECT) / found.standard_deviations[6:])
-    # Root mean square of 60 normal numbers of unit variance: 1 +- 0.09; four of that.
+    # The rms of 60 normal numbers with unit variance is 1 +- 0.09; this allows four of that.
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores), axis=0)), 1.0, atol=0.37)
 
 
-def test_it_is_a_file_like_any_other(tmp_path) -> None:
-    found = load_of_object(recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2))
+def test_object_is_saved_and_loaded(tmp_path) -> None:
+    found = load_of_object(estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2))
     found.save(tmp_path / "object.json")
     again = Identification.load(tmp_path / "object.json")
     np.testing.assert_array_equal(again.covariance, found.covariance)
     np.testing.assert_array_equal(again.phi, found.phi)
 
 
-def test_what_the_gripper_record_left_undetermined_is_so_in_the_difference() -> None:
+def test_parameters_undetermined_for_the_gripper_are_undetermined_for_the_object() -> None:
     rng = np.random.default_rng(3)
     s = rng.normal(size=(30, 3)) * 9
     rest = np.zeros((30, 3))
     wrench = non_contact_wrench(s, rest, rest, GRIPPER) + 0.1 * NOISE * rng.normal(size=(30, 6))
     gripper = identify(wrench, s, rest, rest)
-    found = load_of_object(recorded(GRIPPER + OBJECT, 1), gripper)
+    found = load_of_object(estimate(GRIPPER + OBJECT, 1), gripper)
     assert found.identifiable.tolist() == [True] * 10 + [False] * 6
     assert np.isinf(np.diag(found.covariance)[10:]).all()
     assert consistency_margin(found)[1] == np.inf
 
 
 def test_exchanged_files_are_an_error() -> None:
-    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
     with pytest.raises(DrakeTeleopError, match=r"-0\.7\d* kg for the object.*gripper alone"):
         load_of_object(gripper, total)
     with pytest.raises(DrakeTeleopError, match="0 kg"):
         load_of_object(total, total)
 
 
-def test_the_margin_tells_a_body_from_none_and_from_noise() -> None:
-    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+def test_margin_distinguishes_possible_and_impossible_bodies() -> None:
+    total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
     margin, deviation = consistency_margin(load_of_object(total, gripper))
     assert margin > 3 * deviation > 0
     impossible = OBJECT - np.array([0, 0, 0, 0, 0.018, 0, 0, 0, 0, 0])  # I_xx far too small
     margin, deviation = consistency_margin(
-        load_of_object(recorded(GRIPPER + impossible, 1), gripper)
+        load_of_object(estimate(GRIPPER + impossible, 1), gripper)
     )
     assert margin < -3 * deviation < 0
 
 
-def test_a_negative_mass_is_far_outside() -> None:
-    load = recorded(OBJECT, 1)
+def test_margin_of_a_negative_mass_is_far_below_zero() -> None:
+    load = estimate(OBJECT, 1)
     margin, deviation = consistency_margin(replace(load, phi=-load.phi))
     assert margin < -0.5  # of four eigenvalues with the sum -2
     assert deviation == pytest.approx(consistency_margin(load)[1], rel=10.0)
 
 
-def test_the_margin_s_deviation_is_that_of_its_scatter() -> None:
-    pairs = [consistency_margin(recorded(OBJECT, seed)) for seed in range(80)]
+def test_deviation_of_the_margin_equals_its_scatter() -> None:
+    pairs = [consistency_margin(estimate(OBJECT, seed)) for seed in range(80)]
     margins, deviations = np.array(pairs).T
-    # 80 seeds: a standard deviation is known to 8 %.
+    # 80 seeds give a standard deviation within 8 %.
     assert margins.std(ddof=1) == pytest.approx(np.median(deviations), rel=0.3)
 
 
 def test_degrees_of_freedom_are_those_of_a_sum_of_variances() -> None:
-    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    total, gripper = estimate(GRIPPER + OBJECT, 1), estimate(GRIPPER, 2)
     total = replace(total, degrees_of_freedom=np.full(16, 20.0))
     gripper = replace(
         gripper, degrees_of_freedom=np.full(16, 20.0), covariance=total.covariance.copy()
     )
     found = load_of_object(total, gripper)
-    # Two equal variances with 20 degrees each have 40; the offsets are the total's alone.
+    # Two equal variances with 20 degrees each have 40; only the total has offsets.
     np.testing.assert_allclose(found.degrees_of_freedom, [20.0] * 6 + [40.0] * 10)
     given = replace(total, degrees_of_freedom=np.full(16, np.inf))
-    assert np.isinf(load_of_object(given, given_as_gripper(given)).degrees_of_freedom).all()
+    assert np.isinf(load_of_object(given, with_half_phi(given)).degrees_of_freedom).all()
 
 
-def given_as_gripper(load: Identification) -> Identification:
+def with_half_phi(load: Identification) -> Identification:
     return replace(load, phi=load.phi / 2)

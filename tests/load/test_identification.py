@@ -1,4 +1,4 @@
-"""Batch least squares: exact without noise, honest with it, and on real static poses."""
+"""Batch least squares: exact without noise, stated deviations with it, measured static poses."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def record(samples, seed=0):
 
 
 def static_poses(samples=24, seed=0):
-    """Specific force in random orientations."""
+    """Return the specific force in random orientations."""
     up = np.random.default_rng(seed).normal(size=(samples, 3))
     return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def about_one_axis(samples=500):
-    """Swinging about the horizontal axis y of S, which passes through So."""
+    """Return a swing about the horizontal axis y of S through So."""
     t = np.linspace(0.0, 10.0, samples)
     angle = np.cos(t)
     s = 9.81 * np.stack([np.sin(angle), 0 * t, np.cos(angle)], axis=1)
@@ -70,7 +70,7 @@ def test_same_as_the_stacked_matrix():
     assert result.condition_number == pytest.approx(singular[0] / singular[-1], rel=1e-9)
 
 
-def test_chunks_and_order_do_not_matter():
+def test_result_is_independent_of_chunks_and_order():
     F, motion = record(3000)
     F = F + np.random.default_rng(2).normal(size=F.shape) * NOISE
     whole = identify(F, *motion, noise=NOISE)
@@ -88,7 +88,7 @@ def test_chunks_and_order_do_not_matter():
 
 
 def normalised_errors(noise_of, repetitions=60, samples=4000):
-    """Mean square of error / stated standard deviation, for each parameter."""
+    """Return the mean square of error / stated standard deviation for each parameter."""
     F, motion = record(samples)
     squares = np.zeros(16)
     for seed in range(repetitions):
@@ -98,14 +98,14 @@ def normalised_errors(noise_of, repetitions=60, samples=4000):
     return squares / repetitions
 
 
-def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
-    """Weights are not those of the noise, so that channels leave some of theirs in others."""
+def test_variances_of_channels_follow_from_their_residuals():
+    """Weights differ from the noise, so that noise of a channel leaves residuals in others."""
     rng, n = np.random.default_rng(7), 90
     weights, variances = rng.uniform(0.5, 2.0, 6), rng.uniform(2.0, 3.0, 6)
     A = rng.normal(size=(6, n, 16))
     grams = np.einsum("cni,cnj->cij", A, A)
     inverse = np.linalg.inv(np.einsum("c,cij->ij", weights, grams))
-    # What each channel's noise leaves in each channel's residual: r = (1 - A (A^T W A)^-1 A^T W) e.
+    # Residual of each channel by the noise of each: r = (1 - A (A^T W A)^-1 A^T W) e.
     rows = A.reshape(6 * n, 16)
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
@@ -117,7 +117,7 @@ def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
 
 def test_stated_deviations_hold_for_white_noise():
     errors = normalised_errors(lambda rng, n: rng.normal(size=(n, 6)))
-    # 1 would be perfect; each is the mean of 60 squares and scatters by 0.18.
+    # The expected value is 1; each is the mean of 60 squares with a scatter of 0.18.
     assert errors.max() < 1.6
     assert 0.8 < errors.mean() < 1.2
 
@@ -131,12 +131,12 @@ def test_stated_deviations_hold_for_coloured_noise():
         return noise * np.sqrt(1.0 - 0.95**2)
 
     errors = normalised_errors(coloured)
-    # Taken for white, this noise would give about (1 + 0.95) / (1 - 0.95) = 39.
+    # Under the assumption of white noise this would be about (1 + 0.95) / (1 - 0.95) = 39.
     assert errors.max() < 2.0
     assert 0.6 < errors.mean() < 1.4
 
 
-def test_unweighted_deviations_know_newtons_from_newton_metres():
+def test_unweighted_fit_has_separate_deviations_of_force_and_torque():
     F, motion = record(4000)
     squares = np.zeros(16)
     for seed in range(40):
@@ -169,7 +169,7 @@ def test_angles_from_rounding_do_not_count_as_excitation():
     assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
 
 
-def test_one_axis_determines_what_it_moves():
+def test_one_axis_determines_only_the_excited_parameters():
     motion = about_one_axis()
     result = identify(OFFSETS + non_contact_wrench(*motion, TOOL), *motion)
     unknown = {
@@ -184,7 +184,7 @@ def test_one_pose_determines_no_mass():
     s = np.tile([0.0, 0.0, 9.81], (50, 1))
     F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
     result = identify(F, s, REST, REST)
-    # The minimum norm solution reproduces the wrench; only what one pose tells is called known.
+    # The minimum norm solution reproduces the wrench; one pose determines few parameters.
     predicted = result.offsets + non_contact_wrench(s, REST, REST, result.phi)
     np.testing.assert_allclose(predicted, F, atol=1e-9)
     known = {n for n, known in zip(PARAMETER_NAMES, result.identifiable, strict=True) if known}
@@ -203,7 +203,7 @@ def test_slow_motion_in_noise_does_not_determine_the_inertia():
     assert not result.identifiable[10:].any()
 
 
-def test_the_wrong_sign_gives_a_negative_mass():
+def test_wrong_sign_gives_a_negative_mass():
     F, motion = record(500)
     result = identify(-F, *motion)
     assert result.mass == pytest.approx(-TOOL[0])
@@ -211,12 +211,12 @@ def test_the_wrong_sign_gives_a_negative_mass():
     np.testing.assert_allclose(result.com, TOOL[1:4] / TOOL[0])
 
 
-def test_real_static_poses():
+def test_measured_static_poses_give_the_load():
     path = DATA / "ntnu_fts_imu_contact" / "0-calibration_fts-accel.csv"
     if not path.is_file():
         pytest.skip("needs the NTNU static poses, which the project does not ship")
     table = np.genfromtxt(path, delimiter=",", skip_header=1)
-    wrench, g = -table[:, :6], table[:, 9:12]  # the sensor reports the load's wrench on it
+    wrench, g = -table[:, :6], table[:, 9:12]  # wrench of the load on the sensor
     result = identify(wrench, -g, REST, REST)
     assert result.samples == 24
     assert result.mass == pytest.approx(0.9323, abs=0.0005)
@@ -229,18 +229,18 @@ def test_real_static_poses():
 # ---- the file
 
 
-def same(a: Identification, b: Identification) -> bool:
+def are_equal(a: Identification, b: Identification) -> bool:
     return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in Identification.__annotations__)
 
 
 @pytest.mark.parametrize("poses_only", [False, True])
-def test_file_round_trip(tmp_path, poses_only):
+def test_saved_identification_is_loaded_unchanged(tmp_path, poses_only):
     s = static_poses()
     F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
     result = identify(F, s, REST, REST) if poses_only else identify(record(99)[0], *record(99)[1])
     path = tmp_path / "identification.json"
     result.save(path)
-    assert same(Identification.load(path), result)
+    assert are_equal(Identification.load(path), result)
     document = json.loads(path.read_text())
     assert set(document) == {
         *("phi", "offsets", "covariance", "identifiable", "mass", "com", "inertia_com"),
@@ -253,42 +253,42 @@ def test_file_round_trip(tmp_path, poses_only):
     assert nulls == (list(range(10, 16)) if poses_only else [])
 
 
-def drop(name):
+def remove_field(name):
     return lambda document: document.pop(name)
 
 
-def put(name, value):
+def set_field(name, value):
     return lambda document: document.update({name: value})
 
 
-def hole(document):
+def remove_covariance_entry(document):
     document["covariance"][0][1] = None
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (drop("phi"), "json:phi: is missing"),
-        (drop("delay_s"), "json:delay_s: is missing"),
-        (put("weight", 3.0), "json:weight: is not a field"),
-        (put("phi", [1.0] * 9), r"json:phi: has shape \(9,\) instead of \(10,\)"),
-        (put("phi", [float("nan")] * 10), "json:phi: is not finite"),
-        (put("phi", None), "json:phi: "),
-        (put("phi", [0.0] * 10), "json:phi: .* not identified"),
-        (put("offsets", ["a"] * 6), "json:offsets: contains values that are not numbers"),
-        (put("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
-        (put("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
-        (hole, "json:covariance: contains values that are not numbers"),
-        (put("identifiable", [True] * 15), "json:identifiable: is not a list"),
-        (put("identifiable", ["yes"] * 16), "json:identifiable: is not a list"),
-        (put("mass", 99.0), "json:mass: contradicts phi"),
-        (put("com", [0.0, 0.0]), "json:com: has shape"),
-        (put("physically_consistent", False), "json:physically_consistent: contradicts"),
-        (put("method", ["guess"]), "json:method: is not a text"),
-        (put("samples", "many"), "json:samples: contains values that are not numbers"),
+        (remove_field("phi"), "json:phi: is missing"),
+        (remove_field("delay_s"), "json:delay_s: is missing"),
+        (set_field("weight", 3.0), "json:weight: is not a field"),
+        (set_field("phi", [1.0] * 9), r"json:phi: has shape \(9,\) instead of \(10,\)"),
+        (set_field("phi", [float("nan")] * 10), "json:phi: is not finite"),
+        (set_field("phi", None), "json:phi: "),
+        (set_field("phi", [0.0] * 10), "json:phi: .* not identified"),
+        (set_field("offsets", ["a"] * 6), "json:offsets: contains values that are not numbers"),
+        (set_field("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
+        (set_field("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
+        (remove_covariance_entry, "json:covariance: contains values that are not numbers"),
+        (set_field("identifiable", [True] * 15), "json:identifiable: is not a list"),
+        (set_field("identifiable", ["yes"] * 16), "json:identifiable: is not a list"),
+        (set_field("mass", 99.0), "json:mass: contradicts phi"),
+        (set_field("com", [0.0, 0.0]), "json:com: has shape"),
+        (set_field("physically_consistent", False), "json:physically_consistent: contradicts"),
+        (set_field("method", ["guess"]), "json:method: is not a text"),
+        (set_field("samples", "many"), "json:samples: contains values that are not numbers"),
     ],
 )
-def test_spoilt_file(tmp_path, spoil, message):
+def test_damaged_file_raises(tmp_path, spoil, message):
     path = tmp_path / "identification.json"
     identify(record(99)[0], *record(99)[1]).save(path)
     document = json.loads(path.read_text())
@@ -298,7 +298,7 @@ def test_spoilt_file(tmp_path, spoil, message):
         Identification.load(path)
 
 
-def test_a_load_that_was_never_learnt_is_none():
+def test_load_of_zeros_is_refused():
     found = identify(record(99)[0], *record(99)[1])
     with pytest.raises(DrakeTeleopError, match=r"phi: .* not identified"):
         replace(found, phi=np.zeros(10))
@@ -317,15 +317,15 @@ def test_a_load_is_printed_in_eight_lines_with_units():
     assert lines[1].startswith(f"  mass              {TOOL[0]:.4g} +- ")
 
 
-def test_what_is_not_identified_is_not_printed_as_a_number():
-    """Poses at rest tell nothing of the inertia."""
+def test_undetermined_parameters_are_printed_without_a_number():
+    """Poses at rest do not determine the inertia."""
     s = static_poses()
     text = str(identify(non_contact_wrench(s, REST, REST, TOOL), s, REST, REST))
     assert "10 of 16 parameters identified, I_xx not, I_xy not" in text
     assert "[?, ?, ?] kg m^2" in text and "+- ?" not in text
 
 
-def test_no_file(tmp_path):
+def test_unreadable_file_raises(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"absent\.json: cannot be read"):
         Identification.load(tmp_path / "absent.json")
     for text, message in [("{", "is not JSON"), ("[1]", "is not a JSON object")]:
@@ -340,7 +340,7 @@ def test_no_file(tmp_path):
 # ---- bad input
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     F, motion = record(10)
     with pytest.raises(DrakeTeleopError, match=r"^wrench: has shape \(10, 5\)"):
         identify(F[:, :5], *motion)
@@ -357,8 +357,8 @@ def test_bad_input_is_named():
 
 
 @pytest.mark.parametrize(("rest", "known"), [(4.0, False), (50.0, True)])
-def test_what_is_determined_is_measured_against_the_largest_eigenvalue(rest, known):
-    """Sixteen columns that are all but one: the largest eigenvalue is 16, the others are `rest`."""
+def test_parameters_are_determined_relative_to_the_largest_eigenvalue(rest, known):
+    """Sixteen almost equal columns: the largest eigenvalue is 16, the others are `rest`."""
     gram = np.ones((16, 16)) + rest * 1e-12 * np.eye(16)
     undetermined = _pseudo_inverse(gram, np.zeros(16, dtype=bool))[1]
     assert np.all(undetermined != known)

@@ -1,4 +1,4 @@
-"""phi and its other forms."""
+"""Inertial parameters phi and their equivalent forms."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drake_teleop.load.inertia import (
 
 
 def point_masses(masses, positions):
-    """phi of point masses, by the definition of the inertia tensor."""
+    """Return phi of point masses by the definition of the inertia tensor."""
     phi = np.zeros(10)
     for m, r in zip(masses, positions, strict=True):
         tensor = m * (r @ r * np.eye(3) - np.outer(r, r))
@@ -57,7 +57,7 @@ def test_pseudo_inertia_round_trip(phi):
 
 
 @given(rotations(), vectors(3, 1.0), st.integers(0, 1000))
-def test_transform_moves_every_point(R_AB, p_AoBo_A, seed):
+def test_transform_equals_that_of_point_masses(R_AB, p_AoBo_A, seed):
     rng = np.random.default_rng(seed)
     masses, r_B = rng.uniform(0.1, 1.0, 5), rng.uniform(-1.0, 1.0, (5, 3))
     expected = point_masses(masses, r_B @ R_AB.T + p_AoBo_A)
@@ -66,7 +66,7 @@ def test_transform_moves_every_point(R_AB, p_AoBo_A, seed):
 
 
 @given(loads(), rotations(), vectors(3, 1.0))
-def test_transform_there_and_back(phi, R_AB, p_AoBo_A):
+def test_inverse_transform_restores_phi(phi, R_AB, p_AoBo_A):
     there = transform_phi(phi, R_AB, p_AoBo_A)
     back = transform_phi(there, R_AB.T, -R_AB.T @ p_AoBo_A)
     np.testing.assert_allclose(back, phi, rtol=0, atol=1e-11)
@@ -91,15 +91,15 @@ def test_transform_there_and_back(phi, R_AB, p_AoBo_A):
 )
 def test_physical_consistency(phi, consistent):
     assert is_physically_consistent(phi) is consistent
-    # ... in grams and millimetres as in kilograms and metres.
+    # The result is the same in grams and millimetres.
     scale = np.repeat([1e3, 1e6, 1e9], [1, 3, 6])
     assert is_physically_consistent(scale * phi) is consistent
 
 
-def test_tolerance_admits_what_lies_just_outside():
+def test_tolerance_accepts_loads_just_outside():
     phi = phi_from_mass_com_inertia(1.0, np.zeros(3), np.diag([1.0, 1.0, 2.0 + 1e-6]))
     assert not is_physically_consistent(phi)
-    # Sigma's least is -5e-7, and its trace, the unit, 2; of a load of any mass.
+    # The least eigenvalue of Sigma is -5e-7 and its trace 2, for any mass.
     for mass in (1e-3, 1.0, 1e3):
         assert is_physically_consistent(mass * phi, tolerance=2.6e-7)
         assert not is_physically_consistent(mass * phi, tolerance=2.4e-7)
@@ -120,6 +120,6 @@ def test_tolerance_admits_what_lies_just_outside():
         (lambda: transform_phi(TOOL, -np.eye(3), np.zeros(3)), "^R_AB: is not a rotation"),
     ],
 )
-def test_bad_input_is_named(call, message):
+def test_error_names_the_invalid_input(call, message):
     with pytest.raises(DrakeTeleopError, match=message):
         call()

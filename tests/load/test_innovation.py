@@ -1,4 +1,4 @@
-"""Blocks whose model is known to a share of the wrench: how they are whitened."""
+"""Whitening of block means with a relative model error of the wrench."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from drake_teleop.load.online.change import whitening_matrix
 from drake_teleop.load.regressor import non_contact_wrench
 
 
-def test_a_share_of_force_and_torque_is_not_known():
-    """Of a block of any length: of |f|; for torques of |tau|, and of |f| at the centre of mass."""
+def test_whitening_includes_model_errors_of_force_and_torque():
+    """Shares of |f| for forces; of |tau|, and of |f| at the centre of mass, for torques."""
     motion = np.array([1.0, -2.0, 9.0, 0.5, 2.0, -1.0, 20.0, -10.0, 60.0])
     wrench = non_contact_wrench(*np.split(motion, 3), TOOL)
     f, tau = np.sum(wrench[:3] ** 2), np.sum(wrench[3:] ** 2)

@@ -1,4 +1,4 @@
-"""Recursive instrumental variables: no bias, whatever the noise; weak instruments; bad input."""
+"""Recursive instrumental variables: bias, weak instruments, invalid input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INERTIAS = [10, 13, 15]
 
 
 def record(seed, samples=1500):
-    """Wrench, measured motion, and the motion as commanded: 10 samples late, and 3 % too small."""
+    """Return wrench, measured motion, and the commanded motion: 10 samples late, 3 % too small."""
     rng = np.random.default_rng(seed)
     motion = rich_motion(samples)
     F = OFFSETS + non_contact_wrench(*motion, TOOL) + NOISE * rng.normal(size=(samples, 6))
@@ -34,28 +34,28 @@ def record(seed, samples=1500):
     return F, [x + n for x, n in zip(motion, noise, strict=True)], commanded
 
 
-def learnt(F, motion, instruments, **options):
+def run_estimator(F, motion, instruments, **options):
     estimator = RecursiveInstrumentalVariables(NOISE, **options)
     estimator.update_samples(F, *motion, instruments)
     return estimator
 
 
-def theta(estimator):
+def state_of(estimator):
     return np.concatenate([estimator.offsets, estimator.phi])
 
 
-def stacked(motion):
+def stacked_regressor(motion):
     V = regressor(*motion)
     return np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
 
 
 @pytest.mark.parametrize("own", [pytest.param(True, marks=pytest.mark.long), False])
-def test_it_is_three_stage_least_squares(own):
-    """Against the stacked matrices; with the motion as its own instrument, weighted LS."""
+def test_result_equals_three_stage_least_squares(own):
+    """Compare with the stacked matrices; the motion as its own instrument gives weighted LS."""
     F, motion, commanded = record(0)
     instruments = np.hstack(motion) if own else commanded
-    estimator = learnt(F, motion, instruments)
-    X, Y = stacked(motion), stacked(np.split(instruments, 3, axis=1))
+    estimator = run_estimator(F, motion, instruments)
+    X, Y = stacked_regressor(motion), stacked_regressor(np.split(instruments, 3, axis=1))
     found = np.zeros(16)
     for _ in range(6):
         r = F - X @ found
@@ -65,32 +65,32 @@ def test_it_is_three_stage_least_squares(own):
         g = np.einsum("nci,cd,nd->i", Y, W, F)
         first = np.linalg.solve(M, R).T
         found = np.linalg.solve(first @ R, first @ g)
-    np.testing.assert_allclose(theta(estimator), found, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(state_of(estimator), found, rtol=1e-4, atol=1e-6)
 
 
-def test_the_prior_weighs_as_its_deviations_say():
-    """After one sample, which leaves most to the prior; against the stacked matrices."""
+def test_prior_has_the_weight_of_its_deviations():
+    """Compare with the stacked matrices after one sample, where the prior dominates."""
     F, motion, commanded = record(7, samples=1)
     deviations = 0.2 * np.array(PRIOR_STD)
-    estimator = learnt(F, motion, commanded, prior_std=deviations)
-    X, Y = stacked(motion)[0], stacked(np.split(commanded, 3, axis=1))[0]
+    estimator = run_estimator(F, motion, commanded, prior_std=deviations)
+    X, Y = stacked_regressor(motion)[0], stacked_regressor(np.split(commanded, 3, axis=1))[0]
     W = np.linalg.inv((F.T @ F + 20.0 * np.diag(NOISE**2)) / 21)
     prior = np.diag(deviations**-2)
     first = np.linalg.solve(Y.T @ W @ Y + prior, Y.T @ W @ X).T
     found = np.linalg.solve(first @ (Y.T @ W @ X) + prior, first @ (Y.T @ W @ F[0]))
-    np.testing.assert_allclose(theta(estimator), found, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(state_of(estimator), found, rtol=1e-5, atol=1e-7)
 
 
-def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest():
+def test_bias_is_removed_without_known_noise_and_the_covariance_is_right():
     errors, leasts, squares = [], [], []
     for seed in range(30):
         F, motion, commanded = record(seed)
-        estimator = learnt(F, motion, commanded)
-        errors.append(theta(estimator) - TRUTH)
+        estimator = run_estimator(F, motion, commanded)
+        errors.append(state_of(estimator) - TRUTH)
         squares.append(np.square(errors[-1]) / np.diag(estimator.covariance))
         least = RecursiveLeastSquares(NOISE)
         least.update_samples(F, *motion)
-        leasts.append(theta(least) - TRUTH)
+        leasts.append(state_of(least) - TRUTH)
     mean = np.mean(leasts, axis=0)
     assert (np.abs(mean) > 3.0 * np.std(leasts, axis=0) / np.sqrt(30))[INERTIAS].all()
     assert np.abs(np.mean(errors, axis=0) / mean)[INERTIAS].max() < 0.2
@@ -99,31 +99,31 @@ def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest
     assert honest.mean() == pytest.approx(1.0, abs=0.3)
 
 
-def test_useless_instruments_leave_the_prior():
+def test_uncorrelated_instruments_keep_the_prior():
     F, motion, _ = record(1)
-    estimator = learnt(F, motion, np.zeros((1500, 9)))
+    estimator = run_estimator(F, motion, np.zeros((1500, 9)))
     assert not estimator.is_settled
     assert (np.abs(estimator.phi) < 0.1 * np.array(PRIOR_STD[6:])).all()
     deviations = np.sqrt(np.diag(estimator.covariance))
     np.testing.assert_allclose(deviations[6:], PRIOR_STD[6:], rtol=0.05)
 
 
-def test_static_instruments_leave_the_inertia():
+def test_static_instruments_do_not_change_the_inertia():
     F, motion, commanded = record(2)
     commanded[:, 3:] = 0.0
-    result = learnt(F, motion, commanded).identification()
+    result = run_estimator(F, motion, commanded).identification()
     assert result.verdicts[10:] == 6 * ("prior",)
     assert np.isfinite(result.phi).all()
 
 
-def test_standing_still_does_not_wind_up():
+def test_covariance_is_bounded_at_rest():
     F, motion, commanded = record(3)
-    estimator = learnt(F, motion, commanded, forgetting=0.99)
+    estimator = run_estimator(F, motion, commanded, forgetting=0.99)
     s = np.tile([0.0, 0.0, 9.81], (20_000, 1))
     still = OFFSETS + non_contact_wrench(s, 0.0 * s, 0.0 * s, TOOL)
     still += NOISE * np.random.default_rng(0).normal(size=still.shape)
     estimator.update_samples(still, s, 0.0 * s, 0.0 * s, np.hstack([s, 0.0 * s, 0.0 * s]))
-    assert np.isfinite(theta(estimator)).all()
+    assert np.isfinite(state_of(estimator)).all()
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
     deviations = np.sqrt(np.diag(estimator.covariance))
     assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
@@ -135,23 +135,23 @@ def test_standing_still_does_not_wind_up():
 def test_forgetting_follows_a_new_load():
     thing = np.array([0.5, 0.0, 0.0, 0.06, 0.008, 0.0, 0.0, 0.008, 0.0, 0.001])
     F, motion, commanded = record(4, samples=3000)
-    estimator = learnt(F, motion, commanded, forgetting=0.995)
+    estimator = run_estimator(F, motion, commanded, forgetting=0.995)
     F += non_contact_wrench(*rich_motion(3000), thing)
     estimator.update_samples(F, *motion, commanded)
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
 
 
-def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same(tmp_path):
+def test_samples_log_and_external_state_give_the_same_result(tmp_path):
     F, motion, commanded = record(5, samples=400)
-    log = learnt(F, motion, commanded)
+    log = run_estimator(F, motion, commanded)
     single, elsewhere = (RecursiveInstrumentalVariables(NOISE) for _ in range(2))
     state = np.zeros(16)
     memory = elsewhere.initial_memory(state)
     for sample in zip(F, *motion, commanded, strict=True):
         single.update_samples(*(np.reshape(part, (1, -1)) for part in sample))
         elsewhere.update_into(state, memory, np.concatenate(sample))
-    np.testing.assert_array_equal(theta(single), theta(log))
-    np.testing.assert_array_equal(state, theta(log))
+    np.testing.assert_array_equal(state_of(single), state_of(log))
+    np.testing.assert_array_equal(state, state_of(log))
     np.testing.assert_array_equal(elsewhere.covariance_of(state, memory), log.covariance)
     result = single.identification()
     assert (result.method, result.samples) == ("recursive instrumental variables", 400)
@@ -160,14 +160,14 @@ def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same(tmp_path):
     np.testing.assert_array_equal(read.phi, result.phi)
 
 
-def test_bad_input_is_named_and_leaves_the_estimate():
+def test_error_names_the_invalid_input_and_keeps_the_estimate():
     F, motion, commanded = record(6, samples=50)
-    estimator = learnt(F, motion, commanded)
-    before = theta(estimator)
+    estimator = run_estimator(F, motion, commanded)
+    before = state_of(estimator)
     with pytest.raises(DrakeTeleopError, match=r"^instruments: has shape"):
         estimator.update_samples(F, *motion, np.zeros((50, 3)))
     with pytest.raises(DrakeTeleopError, match=r"^instruments: is not finite"):
         estimator.update_samples(F, *motion, np.full((50, 9), np.inf))
-    np.testing.assert_array_equal(theta(estimator), before)
+    np.testing.assert_array_equal(state_of(estimator), before)
     with pytest.raises(DrakeTeleopError, match="estimator: has not received a sample"):
         RecursiveInstrumentalVariables(NOISE).identification()

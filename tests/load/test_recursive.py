@@ -1,4 +1,4 @@
-"""Recursive least squares against the batch, in time, and where the motion tells nothing."""
+"""Recursive least squares compared with the batch, and its behaviour without excitation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def noisy_record(samples, phi=TOOL, seed=0):
     return OFFSETS + non_contact_wrench(*motion, phi) + noise, motion
 
 
-def learnt(F, motion, **options):
+def run_estimator(F, motion, **options):
     estimator = RecursiveLeastSquares(NOISE, **options)
     for sample in zip(F, *motion, strict=True):
         estimator.update(*sample)
@@ -30,15 +30,15 @@ def learnt(F, motion, **options):
 
 def test_converges_to_the_batch():
     F, motion = noisy_record(3000)
-    estimator, batch = learnt(F, motion), identify(F, *motion, noise=NOISE)
+    estimator, batch = run_estimator(F, motion), identify(F, *motion, noise=NOISE)
     np.testing.assert_allclose(estimator.phi, batch.phi, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(estimator.offsets, batch.offsets, rtol=1e-6)
     np.testing.assert_array_equal(estimator.covariance, estimator.covariance.T)
 
 
-def test_is_bayes_with_the_prior():
+def test_result_is_the_bayesian_estimate_with_the_prior():
     F, motion = noisy_record(7)
-    estimator = learnt(F, motion, prior_std=np.linspace(0.1, 2.0, 16))
+    estimator = run_estimator(F, motion, prior_std=np.linspace(0.1, 2.0, 16))
     rows = np.concatenate([np.tile(np.eye(6), (7, 1, 1)), regressor(*motion)], axis=2)
     rows = (rows / NOISE[:, None]).reshape(-1, 16)
     information = np.diag(np.linspace(0.1, 2.0, 16) ** -2.0) + rows.T @ rows
@@ -50,27 +50,27 @@ def test_is_bayes_with_the_prior():
     )
 
 
-def test_identification_says_what_was_learnt():
+def test_identification_equals_that_of_the_batch():
     F, motion = noisy_record(3000)
-    result = learnt(F, motion).identification()
+    result = run_estimator(F, motion).identification()
     batch = identify(F, *motion, noise=NOISE)
     assert (result.method, result.samples) == ("recursive least squares", 3000)
     assert result.identifiable.all() and result.physically_consistent
     np.testing.assert_allclose(result.residual_rms, batch.residual_rms, rtol=0.02)
-    # The batch takes the variance from the residual, cautiously: up to twice.
+    # The batch estimates a conservative variance from the residual: up to twice.
     ratio = np.diag(batch.covariance) / np.diag(result.covariance)
     assert ratio.min() > 0.9 and ratio.max() < 2.5
     assert result.condition_number == pytest.approx(batch.condition_number, rel=0.01)
 
 
-def test_residual_forgets_with_the_estimate():
+def test_residual_has_the_forgetting_factor_of_the_estimate():
     F, motion = noisy_record(9000)
-    F[:1000, 0] += 50.0 * np.sin(np.arange(1000))  # a disturbance long past
-    result = learnt(F, motion, forgetting=0.998).identification()
+    F[:1000, 0] += 50.0 * np.sin(np.arange(1000))  # an early disturbance
+    result = run_estimator(F, motion, forgetting=0.998).identification()
     assert 0.8 * NOISE[0] < result.residual_rms[0] < 1.1 * NOISE[0]
 
 
-def test_static_poses_leave_the_prior_of_the_inertia():
+def test_static_poses_keep_the_prior_of_the_inertia():
     up = np.random.default_rng(1).normal(size=(200, 3))
     s = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
     F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
@@ -97,9 +97,9 @@ def test_forgetting_follows_a_new_load():
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
 
 
-def test_standing_still_does_not_wind_up():
+def test_covariance_is_bounded_at_rest():
     F, motion = noisy_record(500)
-    estimator = learnt(F, motion, forgetting=0.99)
+    estimator = run_estimator(F, motion, forgetting=0.99)
     s = np.array([0.0, 0.0, 9.81])
     still = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
     for _ in range(20_000):
@@ -115,22 +115,22 @@ def test_standing_still_does_not_wind_up():
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.999])
 def test_a_nearly_ideal_sensor_keeps_the_covariance_positive(forgetting):
-    # Samples so close that one says almost the same as the last.
+    # Samples are so close that each is almost redundant.
     motion = [x[:1000] for x in rich_motion(8000)]
     F = OFFSETS + non_contact_wrench(*motion, TOOL)
     estimator = RecursiveLeastSquares(1e-9 * NOISE, forgetting)
     for sample in zip(F, *motion, strict=True):
         estimator.update(*sample)
-        # Scaled to unit variances: whether a direction is negative beyond rounding.
+        # Unit variances show whether a direction is negative beyond rounding.
         P = estimator.covariance
         scale = 1.0 / np.sqrt(np.diag(P))
         assert np.linalg.eigvalsh(P * np.outer(scale, scale)).min() > -1e-6
     np.testing.assert_allclose(estimator.phi, TOOL, rtol=0, atol=1e-9)
 
 
-def test_updates_an_estimate_that_is_kept_elsewhere():
+def test_external_estimate_is_updated():
     F, motion = noisy_record(50)
-    own = learnt(F, motion)
+    own = run_estimator(F, motion)
     state = np.concatenate([np.zeros(16), np.diag(np.square(PRIOR_STD)).ravel()])
     estimator = RecursiveLeastSquares(NOISE)
     for sample in zip(F, *motion, strict=True):
@@ -141,9 +141,9 @@ def test_updates_an_estimate_that_is_kept_elsewhere():
     np.testing.assert_array_equal(estimator.phi, np.zeros(10))
 
 
-def test_a_log_in_one_call_gives_the_same():
+def test_log_in_one_call_equals_sample_by_sample():
     F, motion = noisy_record(300)
-    own, log = learnt(F, motion, forgetting=0.999), RecursiveLeastSquares(NOISE, 0.999)
+    own, log = run_estimator(F, motion, forgetting=0.999), RecursiveLeastSquares(NOISE, 0.999)
     log.update_samples(F[:100], *(x[:100] for x in motion))
     log.update_samples(F[100:], *(x[100:] for x in motion))
     np.testing.assert_array_equal(log.phi, own.phi)
@@ -185,9 +185,9 @@ def test_a_load_on_an_axis_can_be_settled_and_no_load_cannot():
     assert not estimator.is_state_settled(theta, memory)
 
 
-def test_bad_input_is_named_and_leaves_the_estimate():
+def test_error_names_the_invalid_input_and_keeps_the_estimate():
     F, motion = noisy_record(5)
-    estimator = learnt(F, motion)
+    estimator = run_estimator(F, motion)
     before = estimator.phi
     with pytest.raises(DrakeTeleopError, match=r"^sample: contains NaN or infinity"):
         estimator.update(np.full(6, np.nan), REST, REST, REST)

@@ -1,4 +1,4 @@
-"""Recursive total least squares: no bias from noisy motion, honest covariance, poor excitation."""
+"""Recursive total least squares: bias by noisy motion, covariance, weak excitation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REST = np.zeros(3)
 
 
 def record(seed, samples=1500, motion=None, scale=1.0):
-    """A record with noise in wrench and motion, `scale` times the stated one."""
+    """Return a record with noise in wrench and motion, `scale` times the stated one."""
     rng = np.random.default_rng(seed)
     motion = rich_motion(samples) if motion is None else motion
     F = OFFSETS + non_contact_wrench(*motion, TOOL)
@@ -34,17 +34,17 @@ def record(seed, samples=1500, motion=None, scale=1.0):
     return F + scale * NOISE * rng.normal(size=F.shape), noisy
 
 
-def learnt(F, motion, **options):
+def run_estimator(F, motion, **options):
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION, **options)
     estimator.update_samples(F, *motion)
     return estimator
 
 
-def theta(estimator):
+def state_of(estimator):
     return np.concatenate([estimator.offsets, estimator.phi])
 
 
-def test_without_noise_in_the_motion_it_is_least_squares():
+def test_result_is_least_squares_without_noise_of_the_motion():
     motion = rich_motion(2000)
     noise = NOISE * np.random.default_rng(0).normal(size=(2000, 6))
     F = OFFSETS + non_contact_wrench(*motion, TOOL) + noise
@@ -59,29 +59,29 @@ def test_without_noise_in_the_motion_it_is_least_squares():
     assert total.noise_scale == pytest.approx(1.0, abs=0.05)
 
 
-def test_it_is_the_batch_of_the_samples_so_far():
+def test_result_equals_the_batch_of_all_previous_samples():
     F, motion = record(9)
-    estimator = learnt(F, motion)
+    estimator = run_estimator(F, motion)
     noise = NoiseStd(NOISE, *(std[0] for std in np.split(MOTION, 3)))
     batch = identify_batch(F, *motion, method="total", noise=noise).identification
     np.testing.assert_allclose(estimator.phi, batch.phi, rtol=2e-4, atol=1e-7)
     np.testing.assert_allclose(estimator.offsets, batch.offsets, rtol=2e-4)
 
 
-def test_the_bias_of_the_inertias_is_gone_and_the_covariance_is_honest():
+def test_inertias_are_unbiased_and_the_covariance_is_right():
     totals, leasts, squares = [], [], []
     for seed in range(30):
         F, motion = record(seed)
-        total = learnt(F, motion)
+        total = run_estimator(F, motion)
         least = RecursiveLeastSquares(NOISE)
         least.update_samples(F, *motion)
-        totals.append(theta(total) - TRUTH)
-        leasts.append(theta(least) - TRUTH)
+        totals.append(state_of(total) - TRUTH)
+        leasts.append(state_of(least) - TRUTH)
         squares.append(np.square(totals[-1]) / np.diag(total.covariance))
     least_error, least_std = np.mean(leasts, axis=0), np.std(leasts, axis=0)
     biased = np.abs(least_error) > 3.0 * least_std / np.sqrt(30)
     assert biased[INERTIAS].all()
-    # The stated deviation of least squares does not tell of it.
+    # The stated deviation of least squares does not include the bias.
     predicted = np.sqrt(np.diag(least.covariance))
     assert (np.abs(least_error) > 3.5 * predicted)[INERTIAS].all()
     ratio = np.abs(np.mean(totals, axis=0) / least_error)[INERTIAS]
@@ -93,16 +93,16 @@ def test_the_bias_of_the_inertias_is_gone_and_the_covariance_is_honest():
 
 
 @pytest.mark.filterwarnings("error")
-def test_before_the_first_sample_there_is_the_prior():
+def test_estimate_is_the_prior_before_the_first_sample():
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION)
     np.testing.assert_allclose(estimator.covariance, np.diag(np.square(PRIOR_STD)), rtol=1e-12)
 
 
-def test_finds_the_noises_common_scale():
+def test_common_scale_of_the_noise_is_estimated():
     F, motion = record(0, scale=0.35)
-    estimator = learnt(F, motion)
+    estimator = run_estimator(F, motion)
     assert estimator.noise_scale == pytest.approx(0.35**2, rel=0.1)
-    error = np.abs(theta(estimator) - TRUTH) / np.sqrt(np.diag(estimator.covariance))
+    error = np.abs(state_of(estimator) - TRUTH) / np.sqrt(np.diag(estimator.covariance))
     assert error.max() < 4.0
 
 
@@ -113,14 +113,14 @@ def test_after_one_and_a_half_seconds_the_load_is_settled():
     estimator.update_samples(F[:40], *(x[:40] for x in motion))
     assert not estimator.is_settled
     F, motion = record(2)
-    estimator = learnt(F, motion)
+    estimator = run_estimator(F, motion)
     assert estimator.is_settled
     assert estimator.phi[0] == pytest.approx(TOOL[0], rel=0.02)
     com = estimator.phi[1:4] / estimator.phi[0] - TOOL[1:4] / TOOL[0]
     assert np.linalg.norm(com) < 0.05 * np.linalg.norm(TOOL[1:4] / TOOL[0])
 
 
-def test_without_rotation_the_inertia_stays_bounded_and_is_not_called_known():
+def test_inertia_is_bounded_and_undetermined_without_rotation():
     s, omega, alpha = rich_motion(3000)
     F, motion = record(3, motion=(s, 0.0 * omega, 0.0 * alpha))
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION)
@@ -132,29 +132,29 @@ def test_without_rotation_the_inertia_stays_bounded_and_is_not_called_known():
     assert not result.identifiable[INERTIAS].any()
     assert [result.verdicts[i] for i in INERTIAS] == ["prior"] * 3
     np.testing.assert_allclose(result.standard_deviations[INERTIAS], 1.0, rtol=0.2)
-    error = np.abs(theta(estimator) - TRUTH) / np.sqrt(np.diag(estimator.covariance))
+    error = np.abs(state_of(estimator) - TRUTH) / np.sqrt(np.diag(estimator.covariance))
     assert error[:10].max() < 4.0
     assert result.mass == pytest.approx(TOOL[0], rel=0.002)
 
 
-def test_slow_rotation_does_not_break_it():
-    """Angular accelerations of 1 rad/s^2 under noise of 1.5: half of the information is noise."""
+def test_slow_rotation_gives_a_bounded_estimate():
+    """Angular accelerations of 1 rad/s^2 with noise of 1.5: noise is half of the information."""
     s, omega, alpha = rich_motion(1500)
     errors = []
     for seed in range(10):
-        estimator = learnt(*record(seed, motion=(s, omega, 0.1 * alpha)))
+        estimator = run_estimator(*record(seed, motion=(s, omega, 0.1 * alpha)))
         deviations = np.sqrt(np.diag(estimator.covariance))
-        errors.append((theta(estimator) - TRUTH) / deviations)
+        errors.append((state_of(estimator) - TRUTH) / deviations)
     assert np.abs(errors).max() < 5.0
 
 
-def test_standing_still_does_not_wind_up():
+def test_covariance_is_bounded_at_rest():
     F, motion = record(4)
-    estimator = learnt(F, motion, forgetting=0.99)
+    estimator = run_estimator(F, motion, forgetting=0.99)
     s = np.tile([0.0, 0.0, 9.81], (20_000, 1))
     F_still, still = record(5, motion=(s, 0.0 * s, 0.0 * s))
     estimator.update_samples(F_still, *still)
-    assert np.isfinite(theta(estimator)).all()
+    assert np.isfinite(state_of(estimator)).all()
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
     assert not estimator.is_settled
     deviations = np.sqrt(np.diag(estimator.covariance))
@@ -167,16 +167,16 @@ def test_forgetting_follows_a_new_load():
     motion = rich_motion(3000)
     thing = np.array([0.5, 0.0, 0.0, 0.06, 0.008, 0.0, 0.0, 0.008, 0.0, 0.001])
     F, noisy = record(6, motion=motion)
-    estimator = learnt(F, noisy, forgetting=0.995)
+    estimator = run_estimator(F, noisy, forgetting=0.995)
     estimator.update_samples(F + non_contact_wrench(*motion, thing), *noisy)
-    error = theta(estimator) - TRUTH - np.concatenate([np.zeros(6), thing])
+    error = state_of(estimator) - TRUTH - np.concatenate([np.zeros(6), thing])
     assert (np.abs(error) / np.sqrt(np.diag(estimator.covariance))).max() < 4.5
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
 
 
 @pytest.mark.parametrize("motion_std", [0.0, 1e-6])
 @pytest.mark.parametrize("noise_std", [1e-9, 1e-6])
-def test_an_ideal_sensor_is_no_trouble(noise_std, motion_std):
+def test_ideal_sensor_gives_the_load(noise_std, motion_std):
     motion = rich_motion(3000)
     F = OFFSETS + non_contact_wrench(*motion, TOOL)
     estimator = RecursiveTotalLeastSquares(np.full(6, noise_std), np.full(9, motion_std))
@@ -188,9 +188,9 @@ def test_an_ideal_sensor_is_no_trouble(noise_std, motion_std):
     assert estimator.is_settled and estimator.identification().identifiable.all()
 
 
-def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same():
+def test_samples_log_and_external_state_give_the_same_result():
     F, motion = record(7, samples=300)
-    log = learnt(F, motion, forgetting=0.999)
+    log = run_estimator(F, motion, forgetting=0.999)
     single = RecursiveTotalLeastSquares(NOISE, MOTION, forgetting=0.999)
     elsewhere = RecursiveTotalLeastSquares(NOISE, MOTION, forgetting=0.999)
     state = np.zeros(16)
@@ -198,14 +198,14 @@ def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same():
     for sample in zip(F, *motion, strict=True):
         single.update(*sample)
         elsewhere.update_into(state, memory, np.concatenate(sample))
-    np.testing.assert_array_equal(theta(single), theta(log))
-    np.testing.assert_array_equal(state, theta(log))
+    np.testing.assert_array_equal(state_of(single), state_of(log))
+    np.testing.assert_array_equal(state, state_of(log))
     np.testing.assert_array_equal(elsewhere.covariance_of(state, memory), log.covariance)
     assert single.identification().samples == log.identification().samples == 300
 
 
-def test_starts_from_an_estimate():
-    """What is not excited stays where it was."""
+def test_estimation_starts_from_a_given_estimate():
+    """Parameters without excitation are unchanged."""
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION)
     state = TRUTH.copy()
     memory = estimator.initial_memory(state)
@@ -218,7 +218,7 @@ def test_starts_from_an_estimate():
 
 def test_identification_is_saved_and_read(tmp_path):
     F, motion = record(8)
-    result = learnt(F, motion).identification()
+    result = run_estimator(F, motion).identification()
     assert result.method == "recursive total least squares"
     assert result.identifiable.all() and result.physically_consistent
     batch = identify(F, *motion, noise=NOISE)
@@ -228,7 +228,7 @@ def test_identification_is_saved_and_read(tmp_path):
     np.testing.assert_array_equal(read.phi, result.phi)
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     with pytest.raises(DrakeTeleopError, match=r"^motion_std: has the negative value -"):
         RecursiveTotalLeastSquares(NOISE, -MOTION)
     with pytest.raises(DrakeTeleopError, match=r"^motion_std: has shape \(6,\)"):

@@ -25,7 +25,7 @@ from drake_teleop.load.regressor import (
 
 
 def newton_euler(a, g, omega, alpha, phi):
-    """Eqs. (1) and (2), word for word."""
+    """Return the wrench by Eqs. (1) and (2)."""
     m, mc, I = phi[0], phi[1:4], inertia_about_origin(phi)  # noqa: E741
     f = m * a - m * g + np.cross(alpha, mc) + np.cross(omega, np.cross(omega, mc))
     tau = I @ alpha + np.cross(omega, I @ omega) + np.cross(mc, a) - np.cross(mc, g)
@@ -37,7 +37,7 @@ def assert_close(actual, expected, relative=1e-12):
 
 
 @given(vectors(3, 20.0), motions(), vectors(10))
-def test_both_forms_are_newton_euler(g, motion, phi):
+def test_both_forms_equal_newton_euler(g, motion, phi):
     s, omega, alpha = motion
     expected = newton_euler(s + g, g, omega, alpha, phi)
     assert_close(regressor(s, omega, alpha) @ phi, expected)
@@ -54,7 +54,7 @@ def test_at_rest_the_sensor_carries_the_weight():
 def test_pinocchio_has_the_same_body_regressor():
     """24 motions determine every coefficient of s, alpha and the products of omega.
 
-    Kept of Pinocchio 4.1, whose installation takes long:
+    The reference is a stored result of Pinocchio 4.1, whose installation takes long:
     `pin.bodyRegressor(pin.Motion(v, omega), pin.Motion(s - np.cross(omega, v), alpha))`, any v.
     """
     columns = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio: Ixx, Ixy, Iyy, Ixz, Iyz, Izz
@@ -69,7 +69,7 @@ def test_pinocchio_has_the_same_body_regressor():
 
 
 @given(motions(), rotations(), vectors(3, 0.2))
-def test_drake_inverse_dynamics_need_the_same_wrench(motion, R_WS, p_WS):
+def test_wrench_equals_inverse_dynamics_of_drake(motion, R_WS, p_WS):
     s, omega, alpha = motion
     plant = MultibodyPlant(0.0)
     com, m = TOOL[1:4] / TOOL[0], TOOL[0]
@@ -91,14 +91,14 @@ def test_drake_inverse_dynamics_need_the_same_wrench(motion, R_WS, p_WS):
 
 @pytest.mark.slow
 @given(motions(), loads(), rotations(), vectors(3, 1.0))
-def test_the_wrench_moves_with_frame_and_point(motion, phi_B, R_AB, p_AoBo_A):
+def test_wrench_is_transformed_with_frame_and_point(motion, phi_B, R_AB, p_AoBo_A):
     s_B, omega_B, alpha_B = motion
     f_B, tau_B = np.split(non_contact_wrench(s_B, omega_B, alpha_B, phi_B), 2)
     omega, alpha, p = R_AB @ omega_B, R_AB @ alpha_B, p_AoBo_A
     s = R_AB @ s_B - np.cross(alpha, p) - np.cross(omega, np.cross(omega, p))
     expected = np.concatenate([R_AB @ f_B, R_AB @ tau_B + np.cross(p, R_AB @ f_B)])
     phi_A = transform_phi(phi_B, R_AB, p_AoBo_A)
-    # Terms of the size of phi |s| cancel where the wrench is small.
+    # The wrench may be small compared with its terms of size phi |s|.
     size = np.abs(phi_A).max() * np.abs(regressor(s, omega, alpha)).max()
     difference = np.abs(non_contact_wrench(s, omega, alpha, phi_A) - expected)
     assert difference.max() <= 1e-11 * max(1.0, size)
@@ -123,7 +123,7 @@ def test_one_sample_and_many_are_the_same_to_the_last_bit():
         np.testing.assert_array_equal(wrench[i], wrench_i)
 
 
-def test_any_leading_shape_and_broadcasting():
+def test_leading_dimensions_are_broadcast():
     s, omega, alpha = rich_motion(12)
     grid = [x.reshape(3, 4, 3) for x in (s, omega, alpha)]
     assert regressor(*grid).shape == (3, 4, 6, 10)
@@ -149,6 +149,6 @@ def test_any_leading_shape_and_broadcasting():
         (np.zeros(3), np.zeros(3), np.full(10, np.inf), r"^phi: is not finite"),
     ],
 )
-def test_bad_input_is_named(s, omega, phi, message):
+def test_error_names_the_invalid_input(s, omega, phi, message):
     with pytest.raises(DrakeTeleopError, match=message):
         non_contact_wrench(s, omega, np.zeros(3), phi)

@@ -1,4 +1,4 @@
-"""How well a load is asked to be known."""
+"""Required tolerances of the load."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ INERTIA = np.array([[0.012, 0.001, -0.002], [0.001, 0.009, 0.003], [-0.002, 0.00
 PHI = phi_from_mass_com_inertia(3.1, [0.02, -0.03, 0.085], INERTIA)
 
 
-def test_words_are_read_as_they_are_written() -> None:
-    asked = parse_tolerance(ALL)
-    assert (asked.mass, asked.com, asked.inertia) == (0.005, 0.0005, 0.05)
-    assert str(asked) == ALL and len(asked.required_entry_names) == 10
+def test_text_of_a_tolerance_is_parsed_and_printed() -> None:
+    tolerance = parse_tolerance(ALL)
+    assert (tolerance.mass, tolerance.com, tolerance.inertia) == (0.005, 0.0005, 0.05)
+    assert str(tolerance) == ALL and len(tolerance.required_entry_names) == 10
     assert parse_tolerance("com 1e-3 m").required_entry_names == ("com x", "com y", "com z")
 
 
@@ -33,23 +33,23 @@ def test_words_are_read_as_they_are_written() -> None:
     "text", ["", "mass 0.5", "mass 0.5 mm", "com 1 %", "mass 1 %, mass 2 %", "weight 1 %",
              "mass 0 %", "mass nan %", "mass 1e5 %", "mass 1.1.1 %"],
 )  # fmt: skip
-def test_what_is_no_tolerance_is_refused(text: str) -> None:
+def test_invalid_tolerance_is_refused(text: str) -> None:
     with pytest.raises(DrakeTeleopError, match=r"tolerance|outside"):
         parse_tolerance(text)
 
 
-def test_small_errors_are_those_of_the_numbers_themselves() -> None:
-    asked, step = parse_tolerance(ALL), 1e-6
+def test_derivatives_equal_finite_differences() -> None:
+    tolerance, step = parse_tolerance(ALL), 1e-6
     steps = step * np.eye(10)
-    values = partial(required_values, asked)
-    moved = [values(PHI + row) - values(PHI - row) for row in steps]
-    numbers = np.array(moved).T / (2.0 * step) / tolerances_in_units(asked, PHI)[:, None]
-    errors = derivatives_over_tolerances(asked, PHI)
+    values = partial(required_values, tolerance)
+    differences = [values(PHI + row) - values(PHI - row) for row in steps]
+    numbers = np.array(differences).T / (2.0 * step) / tolerances_in_units(tolerance, PHI)[:, None]
+    errors = derivatives_over_tolerances(tolerance, PHI)
     np.testing.assert_array_equal(errors[:, :6], 0.0)
     np.testing.assert_allclose(errors[:, 6:], numbers, rtol=1e-6, atol=1e-6 * np.abs(numbers).max())
 
 
-def test_what_depends_on_the_unknown_is_unknown() -> None:
+def test_values_of_undetermined_parameters_have_infinite_deviations() -> None:
     covariance = np.diag(np.full(16, 1e-8))
     covariance[10, 10] = np.inf  # I_xx
     known = np.isfinite(

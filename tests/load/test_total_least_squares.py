@@ -1,4 +1,4 @@
-"""Errors in variables: the moments hold what the stacked matrix does, and TLS has no bias."""
+"""Total least squares: second moments equal the stacked matrix, and results are unbiased."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def moments_of(arrays, **weights):
     return moments
 
 
-def test_moments_hold_the_stacked_matrix():
+def test_moments_equal_those_of_the_stacked_matrix():
     F, *motion = noisy(record(), 1)
     A = np.concatenate([np.tile(np.eye(6), (500, 1, 1)), regressor(*motion)], axis=2)
     root = np.random.default_rng(2).normal(size=(6, 6))
@@ -68,7 +68,7 @@ def test_exact_without_noise(noise):
     np.testing.assert_allclose(form.theta, TRUTH, rtol=0, atol=1e-9)
 
 
-def test_no_bias_where_least_squares_has_one():
+def test_result_is_unbiased_in_contrast_to_least_squares():
     clean = record()
     errors = np.empty((2, 40, 16))
     for seed in range(40):
@@ -82,7 +82,7 @@ def test_no_bias_where_least_squares_has_one():
     assert np.abs(bias[1] / deviation[1]).max() < 4.0
 
 
-def test_scale_says_how_wrong_the_stated_noise_is():
+def test_scale_is_the_ratio_of_true_and_stated_noise():
     moments = moments_of(noisy(record(4000), 5))
     stated = NoiseStd(s=0.05, omega=0.015, alpha=1.5)
     form = total_least_squares(moments, stated, 0.5 * WRENCH_NOISE)
@@ -100,7 +100,7 @@ def test_known_offsets():
     np.testing.assert_allclose(form.theta[6:], TOOL, rtol=0, atol=1e-9)
 
 
-def test_static_poses_leave_the_inertia_at_zero():
+def test_static_poses_give_zero_inertia():
     s = record(50)[1]
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     moments = moments_of((F, s, np.zeros(3), np.zeros(3)))
@@ -109,7 +109,7 @@ def test_static_poses_leave_the_inertia_at_zero():
     np.testing.assert_array_equal(form.theta[10:], np.zeros(6))
 
 
-def test_bad_input_is_named():
+def test_error_names_the_invalid_input():
     with pytest.raises(DrakeTeleopError, match=r"^noise\.alpha: has the negative value -"):
         NoiseStd(alpha=-1.0)
     with pytest.raises(

@@ -15,7 +15,7 @@ def random_trajectory(seed: int = 0) -> FourierTrajectory:
     return FourierTrajectory.at_rest(rng.standard_normal(6), sine, cosine, 1 / 6)
 
 
-def test_position_is_equation_9_and_10():
+def test_position_equals_equations_9_and_10():
     rng = np.random.default_rng(1)
     q0, rho, delta = rng.standard_normal(2), *rng.standard_normal((2, 2, 3))
     t, f = 0.37, 0.4
@@ -34,7 +34,7 @@ def test_position_is_equation_9_and_10():
     np.testing.assert_array_equal(trajectory.evaluate([t, 0.0])[1][0], trajectory.evaluate(t)[1])
 
 
-def test_it_starts_and_ends_at_rest_and_moves_in_between():
+def test_trajectory_starts_and_ends_at_rest():
     trajectory = random_trajectory()
     q, qd, qdd = trajectory.evaluate(np.array([0.0, trajectory.period / 3, trajectory.period]))
     np.testing.assert_allclose(qd[[0, 2]], 0, atol=1e-12)
@@ -44,8 +44,8 @@ def test_it_starts_and_ends_at_rest_and_moves_in_between():
     assert np.abs(qd[1]).max() > 1
 
 
-def test_elimination_leaves_all_other_freedom():
-    """Every trajectory at rest is reached: 2 (N - 1) independent motions of each joint."""
+def test_rest_constraints_keep_all_other_freedom():
+    """Every trajectory at rest can be reached: 2 (N - 1) independent motions of each joint."""
     unit = np.eye(8)
     trajectory = FourierTrajectory.at_rest(np.zeros(8), unit[:, :4], unit[:, 4:], 1.0)
     assert np.linalg.matrix_rank(np.hstack([trajectory.rho, trajectory.delta])) == 8
@@ -60,7 +60,7 @@ def test_derivatives_agree_with_finite_differences():
     np.testing.assert_allclose((ahead[1] - behind[1]) / (2 * step), qdd, atol=1e-7)
 
 
-def test_a_saved_trajectory_comes_back_as_it_was(tmp_path):
+def test_saved_trajectory_is_loaded_unchanged(tmp_path):
     trajectory = random_trajectory(3)
     trajectory.save(tmp_path / "e.yaml", tuple("abcdef"))
     again = FourierTrajectory.load(tmp_path / "e.yaml")
@@ -83,7 +83,7 @@ def test_a_saved_trajectory_comes_back_as_it_was(tmp_path):
         "{",
     ],
 )
-def test_a_file_that_is_no_trajectory_is_one_clear_error(tmp_path, text):
+def test_invalid_trajectory_file_is_one_error(tmp_path, text):
     path = tmp_path / "e.yaml"
     path.write_text(text)
     with pytest.raises(DrakeTeleopError, match=r"e\.yaml: "):

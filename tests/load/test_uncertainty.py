@@ -1,4 +1,4 @@
-"""Intervals that hold, verdicts that are not wishes, combinations that the motion determines."""
+"""Intervals, verdicts, and combinations of parameters that the motion determines."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def equations_of(motion, noise=0.0, seed=0):
 
 
 def turntable(samples=400):
-    """Turning about a vertical axis, parallel to z of S and `LEVER` from So along -x of S."""
+    """Return a rotation about a vertical axis, parallel to z of S, at `LEVER` along -x of S."""
     t = np.linspace(0.0, 10.0, samples)
     rate, acceleration = np.cos(t) + 0.3 * np.sin(3 * t), -np.sin(t) + 0.9 * np.cos(3 * t)
     zero = 0.0 * t
@@ -71,17 +71,17 @@ def turntable(samples=400):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", study.COLOURS)
-def test_intervals_hold_in_noise_of_any_colour(colour):
-    # A share of 60 at 95 % has a standard deviation of 2.8 %: fewer than 50 of 60 has a chance of
-    # 2e-4 for each parameter. The mean over 16 parameters, mostly independent, is sharper.
+def test_intervals_cover_the_truth_in_coloured_noise(colour):
+    # A share of 60 at 95 % has a standard deviation of 2.8 %: fewer than 50 of 60 has a probability
+    # of 2e-4 for each parameter. The mean over 16 parameters, mostly independent, is sharper.
     shares = study.coverage(colour, 60, seconds=4.0)
     assert shares["coverage"].min() >= 50 / 60
     assert 0.92 <= shares["coverage"].mean() <= 0.98
-    # The stated variance is that of the errors; mean of 16 x 60 squares.
+    # The stated variance is that of the errors: mean of 16 x 60 squares.
     assert 0.75 < shares["z"].mean() < 1.25
 
 
-def test_noise_is_what_its_name_says():
+def test_noise_has_the_spectrum_of_its_name():
     for colour in study.COLOURS:
         noise = study.coloured_noise(np.random.default_rng(0), 100_000, colour)
         np.testing.assert_allclose(noise.std(axis=0), 1.0, atol=0.08)
@@ -89,7 +89,7 @@ def test_noise_is_what_its_name_says():
     assert np.mean(noise[1:] * noise[:-1]) == pytest.approx(0.95, abs=0.02)
 
 
-def test_the_study_prints_and_judges(capsys, tmp_path):
+def test_study_prints_its_verdict(capsys, tmp_path):
     ok = study.main(["--json", str(tmp_path / "figures.json"), "--seeds", "2"])
     assert "smallest" in capsys.readouterr().out
     document = json.loads((tmp_path / "figures.json").read_text())
@@ -100,7 +100,7 @@ def test_the_study_prints_and_judges(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("name", study.unexcited_records())
-def test_what_does_not_move_is_never_identified(name):
+def test_parameters_without_excitation_are_never_identified(name):
     assert set(study.false_verdicts(name, 20).values()) == {0}
 
 
@@ -118,7 +118,7 @@ def test_long_run_variance_of_known_noise():
 
 
 def test_intervals_are_not_too_wide_if_noise_is_weaker_at_low_frequencies():
-    """White noise without what is below 20 Hz, as of fused accelerations, and a third of white."""
+    """White noise above 20 Hz, as of fused accelerations, plus a third of full white noise."""
     motion = study.motion(1e3, 6.0)
     ideal, n = OFFSETS + non_contact_wrench(*motion, TOOL), len(motion[0])
     filter_ = butter(1, 20.0, "high", fs=1e3)
@@ -129,7 +129,7 @@ def test_intervals_are_not_too_wide_if_noise_is_weaker_at_low_frequencies():
         load = identify(ideal + NOISE * (fast + white / 3), *motion, noise=NOISE)
         error = np.concatenate([load.offsets, load.phi]) - TRUTH
         errors.append(error / load.standard_deviations)
-    # 0.32 with the variance of a sample, 10 / 9 instead of 1 / 9; blocks of 0.1 s still see as much
+    # 0.32 with the variance of a sample, 10 / 9 instead of 1 / 9; blocks of 0.1 s contain as much
     # of the fast noise again.
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.1
 
@@ -148,7 +148,7 @@ def test_few_seconds_of_slow_noise_leave_few_degrees_of_freedom():
     assert slow.degrees_of_freedom.max() < 100.0 < fast.degrees_of_freedom.min()
 
 
-def test_slow_noise_is_told():
+def test_slow_noise_is_reported():
     motion = study.motion(1e3, 4.0)
     ideal = OFFSETS + non_contact_wrench(*motion, TOOL)
 
@@ -175,7 +175,7 @@ def test_slow_noise_is_told():
 
 @settings(max_examples=25, deadline=None)
 @given(unit=st.floats(1e-3, 1e3), seed=st.integers(0, 1000))
-def test_covariance_under_units_of_the_wrench(unit, seed):
+def test_covariance_is_independent_of_the_units_of_the_wrench(unit, seed):
     motion = rich_motion(600, seed)
     wrench = OFFSETS + non_contact_wrench(*motion, TOOL)
     wrench = wrench + NOISE * np.random.default_rng(seed).normal(size=wrench.shape)
@@ -189,7 +189,7 @@ def test_covariance_under_units_of_the_wrench(unit, seed):
 @settings(max_examples=25, deadline=None)
 @given(R=rotations(), seed=st.integers(0, 1000))
 def test_identified_load_does_not_depend_on_the_axes(R, seed):
-    # With isotropic noise and white residuals; R turns the axes of S.
+    # Noise is isotropic and residuals are white; R rotates the axes of S.
     motion = rich_motion(600, seed)
     wrench = OFFSETS + non_contact_wrench(*motion, TOOL)
     std = np.repeat([0.3, 0.01], 3)
@@ -211,7 +211,7 @@ def plain(**changes):
     return dataclasses.replace(load, **changes)
 
 
-def test_quantiles():
+def test_quantiles_equal_tables():
     normal = plain(degrees_of_freedom=np.full(16, np.inf))
     low, high = confidence_intervals(normal)
     np.testing.assert_allclose(high - low, 2 * 1.959964 * normal.standard_deviations, rtol=1e-5)
@@ -220,7 +220,7 @@ def test_quantiles():
     np.testing.assert_allclose(high - low, 2 * 2.776445 * normal.standard_deviations, rtol=1e-5)
 
 
-def test_undetermined_parameters_can_be_anything():
+def test_undetermined_parameters_have_infinite_intervals():
     load = equations_of(turntable()).solve()
     low, high = confidence_intervals(load)
     unknown = np.isinf(load.standard_deviations)
@@ -244,7 +244,7 @@ def test_verdicts_follow_from_the_deviations():
     assert load.verdicts == expected
 
 
-def test_prior_dominated_is_what_the_data_did_not_tell():
+def test_parameters_undetermined_by_data_are_prior_dominated():
     assert is_prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
         *(False, True, True, False)
     ]
@@ -290,7 +290,7 @@ def test_old_files_without_the_optional_fields_are_read(tmp_path):
         ("verdicts", ["identified"] * 15, "json:verdicts: contradicts"),
     ],
 )
-def test_spoilt_optional_fields(tmp_path, field, value, message):
+def test_invalid_optional_fields_raise(tmp_path, field, value, message):
     path = tmp_path / "identification.json"
     plain().save(path)
     document = json.loads(path.read_text())
@@ -303,26 +303,26 @@ def test_spoilt_optional_fields(tmp_path, field, value, message):
 # ---- combinations
 
 
-def stacked(motion):
+def stacked_regressor(motion):
     V = regressor(*motion)
     return np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2).reshape(-1, 16)
 
 
-def test_a_turntable_determines_sums():
+def test_turntable_determines_sums_of_parameters():
     motion = turntable()
     base = base_parameters(equations_of(motion, noise=1e-3))
-    rows = stacked(motion)
+    rows = stacked_regressor(motion)
     assert base.num_combinations == np.linalg.matrix_rank(rows, tol=1e-9 * np.linalg.norm(rows))
     assert set(base.parameters_without_influence) == {"I_xx", "I_xy", "I_yy"}
     coefficients = np.array([c.coefficients for c in base.combinations])
-    # No combination changes along the null space, and its estimate is the truth's.
+    # Combinations are constant along the null space, and their estimates are right.
     _, singular, vectors = np.linalg.svd(rows)
     null = vectors[(singular > 1e-9 * singular[0]).sum() :]
     np.testing.assert_allclose(coefficients @ null.T, 0.0, atol=1e-5)
     for c in base.combinations:
         assert abs(c.value - c.coefficients @ TRUTH) < 5 * c.standard_deviation + 1e-6
         assert c.coefficients[c.leading_index] == 1.0
-    # Of I_zz only I_zz + 0.2 m c_x, and of the mass only m c_x + 0.2 m, have a part in the wrench.
+    # Only I_zz + 0.2 m c_x and m c_x + 0.2 m have a part in the wrench.
     for known in (unit("I_zz") + LEVER * unit("m c_x"), unit("m c_x") + LEVER * unit("m")):
         solution = np.linalg.lstsq(coefficients.T, known, rcond=None)[0]
         np.testing.assert_allclose(coefficients.T @ solution, known, atol=1e-5)
@@ -335,7 +335,7 @@ def unit(name):
     return np.eye(16)[PARAMETER_NAMES.index(name)]
 
 
-def test_one_pose_in_words():
+def test_text_of_one_pose_names_the_combinations():
     still = np.zeros((100, 3))
     lines = base_parameters(
         equations_of((still + np.array([0.0, 0.0, 9.81]), still, still), noise=1e-3)
@@ -350,7 +350,7 @@ def test_one_pose_in_words():
     }
 
 
-def test_a_full_record_has_nothing_to_add():
+def test_text_of_a_full_record_has_one_line():
     base = base_parameters(equations_of(rich_motion(2000), noise=1.0))
     assert (
         base.num_combinations == 16
@@ -400,7 +400,7 @@ def test_predicted_wrench_scatters_as_stated():
 
 
 def poses_at_rest(count, rng):
-    """(count, 3) specific force that differs along two directions at least."""
+    """Return (count, 3) specific forces with at least two directions."""
     while True:
         s = Rotation.random(count, random_state=rng).apply([0.0, 0.0, 9.81])
         if np.linalg.svd(s - s.mean(axis=0), compute_uv=False)[1] > np.sqrt(count):
@@ -408,7 +408,7 @@ def poses_at_rest(count, rng):
 
 
 def loads_at_rest(count, tables, repeats=1, misfit=0.0):
-    """Loads from tables of poses at rest, with errors of a pose and of a row in units of NOISE."""
+    """Return loads from poses at rest with errors of a pose and of a row in units of NOISE."""
     rng = np.random.default_rng(count)
     for _ in range(tables):
         s = poses_at_rest(count, rng)
@@ -426,7 +426,7 @@ GROUPS = {"offsets": slice(0, 6), "mass": slice(6, 7), "first moments": slice(7,
 @pytest.mark.long
 @pytest.mark.parametrize(("repeats", "misfit"), [(1, 0.0), (8, 0.0), (8, 4.0)])
 def test_intervals_of_poses_at_rest_cover_the_truth(repeats, misfit):
-    """Also where an orientation has an error that all of its repetitions share."""
+    """An orientation may have an error that all of its repetitions share."""
     covered = []
     for count in (3, 4, 6, 12) if repeats == 1 else (4, 6, 12):
         for load in loads_at_rest(count, 300 if repeats == 1 else 150, repeats, misfit):
@@ -447,7 +447,7 @@ def test_degrees_of_freedom_of_poses_at_rest(count):
 
 
 @pytest.mark.parametrize("resolution", [(0.1, 0.002), (0.02, 0.05)])
-def test_poses_at_rest_are_no_better_known_than_the_resolution_allows(resolution):
+def test_deviations_of_poses_at_rest_include_the_resolution(resolution):
     s = poses_at_rest(5, np.random.default_rng(4))
     F = OFFSETS + non_contact_wrench(s, 0 * s, 0 * s, TOOL)
     exact, rounded, twice = (
@@ -460,14 +460,14 @@ def test_poses_at_rest_are_no_better_known_than_the_resolution_allows(resolution
     np.testing.assert_allclose(
         twice.standard_deviations[:10], 2.0 * rounded.standard_deviations[:10]
     )
-    # Of the mean of five forces alone, and of five torques alone.
+    # Only the mean of five forces, and of five torques.
     least = np.repeat(resolution, 3) / np.sqrt(12 * 5)
     assert (rounded.standard_deviations[:6] >= least).all()
     assert (rounded.standard_deviations[:6] < 3.0 * least).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_poses_about_the_vertical_determine_three_offsets_alone(seed):
+def test_poses_about_the_vertical_determine_only_three_offsets(seed):
     s = np.tile([0.0, 0.0, 9.81], (6, 1))
     F = OFFSETS + non_contact_wrench(s, 0 * s, 0 * s, TOOL)
     F = F + SHARED * np.random.default_rng(seed).normal(size=F.shape)

@@ -1,4 +1,4 @@
-"""A motion whose derivatives are known in closed form, and the logs of a sensor that makes it."""
+"""Motion with derivatives in closed form, and the logs of a sensor on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GRAVITY_W = np.array([0.0, 0.0, -9.80665])
 
 @dataclass(frozen=True)
 class Motion:
-    """R_WS = Rz(a(t)) Rx(b(t)) and p_WS(t): smooth, and all ten parameters show in it."""
+    """Smooth R_WS = Rz(a(t)) Rx(b(t)) and p_WS(t) that excite all ten parameters."""
 
     t: NDArray[np.float64]
     R_WS: NDArray[np.float64]
@@ -23,7 +23,7 @@ class Motion:
 
 
 def _sine(t: NDArray[np.float64], size: float, rate: float, phase: float) -> NDArray[np.float64]:
-    """Value, first and second derivative, (3, N)."""
+    """Return value, first and second derivative, (3, N)."""
     w = 2 * np.pi * rate
     return size * np.array(
         [
@@ -35,7 +35,7 @@ def _sine(t: NDArray[np.float64], size: float, rate: float, phase: float) -> NDA
 
 
 def motion_at(t: NDArray[np.float64]) -> Motion:
-    """The motion at the times t (N,)."""
+    """Return the motion at the times t (N,)."""
     a, da, dda = _sine(t, 1.2, 0.7, 0.3) + _sine(t, 0.3, 1.9, 1.0)
     b, db, ddb = _sine(t, 0.9, 0.9, 0.0) + _sine(t, 0.4, 1.7, 2.0)
     zero, one = np.zeros_like(t), np.ones_like(t)
@@ -56,7 +56,7 @@ def motion_at(t: NDArray[np.float64]) -> Motion:
 
 
 def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4) wxyz of (N, 3, 3); the sign is arbitrary, as in real logs."""
+    """Return (N, 4) wxyz of (N, 3, 3); the sign is arbitrary, as in real logs."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]

@@ -1,4 +1,4 @@
-"""Good logs, and errors of convention to plant into them."""
+"""Valid logs, and errors of convention to plant into them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Columns = dict[str, np.ndarray]
 def good(
     *, delay_s: float = 0.0, seed: int = 5, phi: NDArray[np.float64] = PHI, start: float = 0.0
 ) -> Columns:
-    """4 s at 500 Hz: a wrist sensor with an IMU and the pose of the arm, noise in all of them."""
+    """Return noisy data of a wrist sensor with an IMU and the pose of the arm, 4 s at 500 Hz."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, 4, 2e-3)
     now, then = motion_at(start + t), motion_at(start + t - delay_s)
@@ -42,7 +42,7 @@ def good(
 
 
 def written(folder: Path, columns: Columns, *, imu: bool = True, pose: bool = True) -> Path:
-    """A log of these columns in a table for each stream, and its description."""
+    """Write each stream of the columns to a table, and the description."""
     form = "quaternion_wxyz" if columns.get("vectors") is None else "rotation_vector"
     q = columns.get("q", columns.get("vectors"))
     q = quaternions(columns["R"]) if q is None else q
@@ -59,17 +59,17 @@ def written(folder: Path, columns: Columns, *, imu: bool = True, pose: bool = Tr
     def stream(name: str) -> dict[str, Any]:
         return {"file": f"{name}.parquet", "time": {"column": "t"}}
 
-    def named(key: str, width: int = 3) -> dict[str, Any]:
+    def field(key: str, width: int = 3) -> dict[str, Any]:
         return {"columns": [f"{key}{i}" for i in range(width)]}
 
     data: dict[str, Any] = {
-        "wrench": stream("wrench") | {"force": named("f"), "torque": named("m")}
+        "wrench": stream("wrench") | {"force": field("f"), "torque": field("m")}
     }
     if imu:
-        data["imu"] = stream("imu") | {"specific_force": named("a"), "angular_velocity": named("w")}
+        data["imu"] = stream("imu") | {"specific_force": field("a"), "angular_velocity": field("w")}
     if pose:
-        orientation = named("q", len(q[0])) | {"form": form}
-        data["pose"] = stream("pose") | {"orientation": orientation, "position": named("p")}
+        orientation = field("q", len(q[0])) | {"form": form}
+        data["pose"] = stream("pose") | {"orientation": orientation, "position": field("p")}
     (folder / "log.yaml").write_text(yaml.safe_dump(data))
     return folder / "log.yaml"
 
@@ -163,7 +163,7 @@ def saturated(c: Columns) -> None:
 
 
 def ntnu_log(folder: Path, tmp_path: Path, record: str, **imu: Any) -> Path:
-    """The description of a real record; `imu` has more fields of that stream."""
+    """Return the description of a real record; `imu` has more fields of that stream."""
 
     def stream(name: str) -> dict[str, Any]:
         return {"file": str(folder / f"{record}_{name}.csv"), "time": {"column": "t", "unit": "us"}}

@@ -23,7 +23,7 @@ PHI = phi_from_mass_com_inertia(
 OFFSETS = np.array([3.1, -1.4, 6.0, 0.13, -0.29, 0.06])
 TRUTH = np.concatenate([OFFSETS, PHI])
 GRAVITY_W = rotation_matrices(np.array([[0.4, -0.2, 0.0]]), "rotation_vector")[0] @ DOWN
-"""Tilted: turned about z and x only, gravity along z would never have an x in S."""
+"""Tilted: with rotations about z and x only, gravity along z would never have an x in S."""
 SECONDS, LATE = 20.0, 0.013
 SHIFT = np.array([0.02, -0.035, 0.15])
 TURN = rotation_matrices(np.array([[0.3, -0.2, 0.6]]), "rotation_vector")[0]
@@ -31,7 +31,7 @@ TURN = rotation_matrices(np.array([[0.3, -0.2, 0.6]]), "rotation_vector")[0]
 
 @dataclass(frozen=True)
 class Kind:
-    """Of a record: rates [Hz], noise of the poses [m, rad] and its colour, frame of the poses."""
+    """Record: rates [Hz], noise of the poses [m, rad] and its colour, frame of the poses."""
 
     wrench_rate: float = 200.0
     rate: float = 125.0
@@ -45,7 +45,7 @@ class Kind:
 
 
 def motion_at(t: np.ndarray) -> Motion:
-    """The known motion at half its speed, in a world whose z is not up."""
+    """Return the known motion at half its speed, in a world whose z is not up."""
     fast = fast_motion_at(0.5 * t)
     acceleration = 0.25 * (fast.specific_force + np.einsum("nji,j->ni", fast.R_WS, DOWN))
     return Motion(

@@ -50,12 +50,12 @@ def described(
     return path
 
 
-def names(found: IdentifiedLog) -> list[str]:
+def cause_names(found: IdentifiedLog) -> list[str]:
     return [cause.name for cause in found.causes]
 
 
-def is_right(found: IdentifiedLog) -> bool:
-    """Whether no number that is called identified is certain and wrong, and the mass is known."""
+def is_consistent_with_truth(found: IdentifiedLog) -> bool:
+    """Return whether the mass is identified and no identified parameter is significantly wrong."""
     load = found.identification
     error = np.abs(np.concatenate([load.offsets, load.phi]) - TRUTH)
     wrong = (error > 4.0 * load.standard_deviations) & (error > 0.02 * natural_scales(PHI))
@@ -63,26 +63,26 @@ def is_right(found: IdentifiedLog) -> bool:
 
 
 @pytest.mark.long
-def test_torque_that_is_ten_times_too_large(tmp_path: Path) -> None:
+def test_factor_of_ten_in_the_torque_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "02_onrobot_counts"))
-    assert names(found) == ["torque factor"]
+    assert cause_names(found) == ["torque factor"]
     assert found.causes[0].values["factor"] == 10.0
     assert found.identification.phi[:4] == pytest.approx(1e4 * PHI[:4], rel=3e-3)
     counts = identify_log(described(tmp_path, "02_onrobot_counts", (1e-4, 1e-5)))
-    assert names(counts) == [] and is_right(counts)
+    assert cause_names(counts) == [] and is_consistent_with_truth(counts)
 
 
 @pytest.mark.long
-def test_tilted_base(tmp_path: Path) -> None:
+def test_tilted_base_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "03_base_tilt3"))
-    assert names(found) == ["gravity direction"] and is_right(found)
+    assert cause_names(found) == ["gravity direction"] and is_consistent_with_truth(found)
     assert found.causes[0].values["gravity"] == pytest.approx([0.513, 0.0, -9.797], abs=0.02)
 
 
 @pytest.mark.long
-def test_load_that_is_grasped_in_the_middle(tmp_path: Path) -> None:
+def test_load_grasped_in_the_middle_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "04_grasp_midway"))
-    assert names(found) == ["load change"] and is_right(found)
+    assert cause_names(found) == ["load change"] and is_consistent_with_truth(found)
     assert found.causes[0].start_s == pytest.approx(8.0, abs=0.05)
     before, after = found.loads
     assert before.phi[0] == pytest.approx(1.37, abs=0.003)
@@ -92,49 +92,49 @@ def test_load_that_is_grasped_in_the_middle(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_bare_flange_has_offsets_and_no_load(tmp_path: Path) -> None:
+def test_bare_flange_has_only_offsets(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "05_nothing_attached"))
-    assert names(found) == ["no load"]
+    assert cause_names(found) == ["no load"]
     assert found.identification.identifiable.tolist() == [True] * 6 + [False] * 10
     error = found.identification.offsets - OFFSETS
     assert (np.abs(error) < 4.0 * found.identification.standard_deviations[:6]).all()
 
 
 @pytest.mark.long
-def test_sensor_that_warms_up(tmp_path: Path) -> None:
+def test_drift_of_a_warming_sensor_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "09_warmup_drift"))
-    assert names(found) == ["drift"]
+    assert cause_names(found) == ["drift"]
     assert found.identification.mass == pytest.approx(1.37, abs=0.003)
 
 
 @pytest.mark.long
-def test_contact_in_most_of_the_record(tmp_path: Path) -> None:
+def test_contact_in_most_of_the_record_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "11_wiping"))
-    assert names(found) == ["contact"] and is_right(found)
+    assert cause_names(found) == ["contact"] and is_consistent_with_truth(found)
     assert found.causes[0].start_s == pytest.approx(2.5, abs=0.1)
     assert found.causes[0].stop_s == pytest.approx(37.5, abs=0.1)
 
 
 @pytest.mark.long
-def test_contact_in_most_of_a_record_of_the_opposite_sign(tmp_path: Path) -> None:
+def test_contact_and_the_opposite_sign_are_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "11_wiping", sign=1))
-    assert names(found) == ["axes", "contact"]
+    assert cause_names(found) == ["axes", "contact"]
     assert found.causes[0].fields == {"wrench.sign": -1}
     assert found.identification.phi[:4] == pytest.approx(PHI[:4], rel=0.02)
 
 
 @pytest.mark.long
-def test_weight_that_the_robot_has_removed() -> None:
+def test_weight_removed_by_the_robot_is_named() -> None:
     found = identify_log(CASES / "14_weight_removed_30hz.csv")
-    assert names(found) == ["weight removed"]
+    assert cause_names(found) == ["weight removed"]
     deviation = found.identification.standard_deviations[6]
     assert abs(found.identification.mass - GRIPPER) < 3.0 * deviation < 0.1
 
 
 @pytest.mark.parametrize(("name", "said"), [("15_free_30hz", []), ("16_touched_30hz", ["contact"])])
-def test_gripper_at_30_frames_a_second(name: str, said: list[str]) -> None:
+def test_load_of_a_gripper_is_identified_at_30_hz(name: str, said: list[str]) -> None:
     found = identify_log(CASES / f"{name}.csv")
-    assert sorted({*names(found)}) == said
+    assert sorted({*cause_names(found)}) == said
     assert found.identification.mass == pytest.approx(GRIPPER, abs=0.005)
 
 

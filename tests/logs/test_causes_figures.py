@@ -87,7 +87,7 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     assert starts == sorted(starts) and {103.0, 105.0} <= set(starts)
 
 
-def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_before():
+def test_load_of_each_part_includes_the_uncertainty_of_earlier_changes():
     steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
     state = state_of(Model(steps=steps), values)
@@ -193,7 +193,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
 
 @pytest.mark.parametrize("rest", [2.0, 3.0])
 def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) -> None:
-    """At rest any load explains the wrench, but it does not predict that of the motion."""
+    """Any load explains the wrench at rest, but it does not predict that of the motion."""
     dt = 0.002
     t = np.arange(0.0, 20.0, dt)
     share = np.clip(2.0 * np.minimum(t - rest, 20.0 - rest - t), 0.0, 1.0)  # of the full speed

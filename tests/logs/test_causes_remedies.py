@@ -1,4 +1,4 @@
-"""A line that a cause states corrects the description: the next fit names nothing and is right."""
+"""Lines that a cause states correct the description: the next fit is right and names no cause."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ class Record:
     gravity: Any = 9.80665
 
     @classmethod
-    def of(
+    def simulate(
         cls, gravity_W: np.ndarray = GRAVITY_W, seconds: float = 12.0, noise: float = 1.0
     ) -> Record:
-        """Make a record by Newton's and Euler's laws about the centre of mass."""
+        """Return a record by Newton's and Euler's laws about the centre of mass."""
         t = np.arange(0.0, seconds, 0.02)
         at, rng = slow(t), np.random.default_rng(1)
         w, alpha = at.omega, at.alpha
@@ -159,33 +159,33 @@ def assert_right(found: IdentifiedLog) -> None:
 
 
 def tilted(degrees: float) -> Record:
-    record = Record.of(Rotation.from_euler("y", degrees, degrees=True).apply(GRAVITY_W))
+    record = Record.simulate(Rotation.from_euler("y", degrees, degrees=True).apply(GRAVITY_W))
     return replace(record, imu_at=None)
 
 
 def axes(Q: np.ndarray, sign: int, frame: np.ndarray) -> Record:
-    record = Record.of()
+    record = Record.simulate()
     record.wrench = record.wrench @ np.kron(np.eye(2), Q).T
     record.described(sign, frame, 1.0, 1.0)
     return record
 
 
 def torque(factor: float) -> Record:
-    record = Record.of()
+    record = Record.simulate()
     record.wrench[:, 3:] *= factor
     record.described(-1, np.eye(3), 1e-4, [1e-5, -1e-5, 2e-5])
     return record
 
 
 def gain(channel: int) -> Record:
-    record = Record.of()
+    record = Record.simulate()
     record.wrench[:, channel] *= 1.03
     record.described(-1, PERMUTATIONS[9], [1.0, 2.0, -3.0], 0.1)
     return record
 
 
 def displaced() -> Record:
-    record = replace(Record.of(), imu_at=None)
+    record = replace(Record.simulate(), imu_at=None)
     record.posed_at(np.array([0.13, -0.02, 0.05]))
     record.pose_lines = {"position_in_sensor": [0.03, 0.04, -0.05]}
     return record
@@ -193,20 +193,20 @@ def displaced() -> Record:
 
 def displaced_imu() -> Record:
     lines = {"position": [0.03, 0.04, -0.05]}
-    return replace(Record.of(), imu_at=np.array([0.13, -0.02, 0.05]), imu_lines=lines)
+    return replace(Record.simulate(), imu_at=np.array([0.13, -0.02, 0.05]), imu_lines=lines)
 
 
 def rotated() -> Record:
-    """Describe all motion in axes that are turned by `TURN`, the IMU's 5 cm from S."""
+    """Describe all motion in axes that are rotated by `TURN`, the IMU's 5 cm from S."""
     place = np.array([0.0, 0.03, 0.04])
-    record = replace(Record.of(), turn=TURN @ OBLIQUE, imu_at=place)
+    record = replace(Record.simulate(), turn=TURN @ OBLIQUE, imu_at=place)
     record.imu_lines = {"frame": OBLIQUE.tolist(), "position": (TURN.T @ place).tolist()}
     record.pose_lines = {"rotation_in_sensor": OBLIQUE.tolist()}
     return record
 
 
 def removed(share: float, com: np.ndarray, described: list[float] | None = None) -> Record:
-    record = Record.of()
+    record = Record.simulate()
     record.without_weight(share * MASS, com)
     record.wrench_lines = {} if described is None else {"weight": described}
     return record
@@ -253,11 +253,11 @@ def test_gravity_auto_finds_the_direction_and_states_it(degrees: float, tmp_path
 
 
 @pytest.mark.parametrize("seed", range(16))
-def test_lines_of_axes_factor_and_gain_compose_with_what_is_described(
+def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     seed: int, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(seed)
-    record = Record.of(seconds=1.0, noise=0.0)
+    record = Record.simulate(seconds=1.0, noise=0.0)
     right = record.wrench.copy()
     causes = [Cause("torque factor", "k", values={"factor": float(rng.choice([-1.0, 10.0, -0.1]))})]
     Q = PERMUTATIONS[rng.integers(48)]
@@ -280,11 +280,9 @@ def test_lines_of_axes_factor_and_gain_compose_with_what_is_described(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_weight_is_added_back_and_a_pose_frame_to_that_described(
-    seed: int, tmp_path: Path
-) -> None:
+def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
-    record = Record.of(seconds=4.0, noise=0.0)
+    record = Record.simulate(seconds=4.0, noise=0.0)
     right, place = record.wrench.copy(), record.position.copy()
     record.imu_at = None
     weight = rng.uniform(0.1, 0.5, 4)
@@ -303,7 +301,7 @@ def test_a_weight_is_added_back_and_a_pose_frame_to_that_described(
 
 
 def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> None:
-    record = Record.of(seconds=1.0)
+    record = Record.simulate(seconds=1.0)
     cause = Cause("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
     log = read_log(record.write(tmp_path))
     [of_table] = add_description_lines([cause], replace(log, source="log.csv"), by_pose=True)
@@ -317,7 +315,7 @@ def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> N
 
 
 def test_counts_are_refused_with_the_scale_to_set(tmp_path: Path) -> None:
-    record = Record.of(seconds=1.0)
+    record = Record.simulate(seconds=1.0)
     record.wrench *= 1e6
     path = record.write(tmp_path)
     with pytest.raises(DrakeTeleopError, match=r"raw counts, set wrench\.force\.scale"):
@@ -330,7 +328,7 @@ def test_counts_are_refused_with_the_scale_to_set(tmp_path: Path) -> None:
 
 
 def test_counts_of_two_scales_give_both_scales(tmp_path: Path) -> None:
-    record = Record.of()
+    record = Record.simulate()
     record.wrench = np.round(record.wrench * np.repeat([1e4, 1e5], 3))
     path = record.write(tmp_path)
     found = identify_log(path)
@@ -368,7 +366,7 @@ def test_inspect_and_repeated_fits_accept_a_removed_weight(tmp_path: Path) -> No
 def test_a_wrong_line_is_refused_in_the_users_terms(
     lines: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
-    path = replace(Record.of(seconds=1.0), imu_at=None).write(tmp_path)
+    path = replace(Record.simulate(seconds=1.0), imu_at=None).write(tmp_path)
     description = yaml.safe_load(path.read_text())
     if lines.pop("imu", False):
         s, omega = {"columns": ["fx", "fy", "fz"]}, {"columns": ["tx", "ty", "tz"]}
@@ -387,7 +385,7 @@ def test_a_wrong_line_is_refused_in_the_users_terms(
 
 
 def test_static_poses_take_a_payload_and_refuse_a_removed_weight(tmp_path: Path) -> None:
-    record = replace(Record.of(seconds=1.0, noise=0.0), imu_at=None)
+    record = replace(Record.simulate(seconds=1.0, noise=0.0), imu_at=None)
     path = record.write(tmp_path)
     description = yaml.safe_load(path.read_text())
     static = {k: v for k, v in description.pop("wrench").items() if k != "time"}

@@ -78,7 +78,7 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
     ],
 )
-def test_each_deviation_has_its_price(change, count):
+def test_each_deviation_increases_the_cost(change, count):
     assert _weighted_number_of_faults(replace(PLAIN, **change), 2.0) == count
 
 
@@ -93,7 +93,7 @@ def test_correct_is_the_inverse_of_apply(gain):
 
 
 def test_calm_half_is_the_narrowest_half_of_each_channel():
-    """Of 8 numbers 5 are within 2 half widths: the half has 4 intervals."""
+    """Five of 8 numbers are within 2 half widths: the half has 4 intervals."""
     x = np.array([5.0, 5.25, 5.5, 5.75, 6.0, 9.0, -20.0, 40.0])
     spread, centres = spread_and_centre_of_calm_half(
         np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3)

@@ -40,7 +40,7 @@ def test_low_pass_keeps_straight_lines_to_the_ends() -> None:
     np.testing.assert_allclose(low_pass(x, 1e-3, 20.0)[:, 0], 1, atol=1e-12)
 
 
-def test_low_pass_above_nyquist_or_none_changes_nothing() -> None:
+def test_low_pass_above_nyquist_has_no_effect() -> None:
     x = np.random.default_rng(1).normal(size=(50, 2))
     assert low_pass(x, 0.1, 30.0) is x
     assert low_pass(x, 0.1, None) is x
@@ -128,7 +128,7 @@ def test_resampling_to_a_slower_clock_does_not_alias(ratio):
     np.testing.assert_allclose(seen[:, 1], np.sin(2 * np.pi * 3.0 * t)[50:-50], atol=0.01)
 
 
-def test_white_noise_is_seen_under_a_smooth_motion() -> None:
+def test_white_noise_is_estimated_beside_a_smooth_motion() -> None:
     rng, sigma = np.random.default_rng(4), np.array([0.02, 0.3, 1.5])
     t = np.arange(0, 20, 1e-3)[:, None]
     motion = 20 * np.sin(2 * np.pi * np.array([0.5, 1.0, 2.0]) * t)

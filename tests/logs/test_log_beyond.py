@@ -1,4 +1,4 @@
-"""Damaged files, and numbers that no log holds: one line each, said once."""
+"""Damaged files and values out of range: each raises one line."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ DAMAGED = {
 }
 
 
-def message(call) -> str:
+def error_line(call) -> str:
     with pytest.raises(DrakeTeleopError) as caught:
         call()
     line = str(caught.value)
@@ -75,32 +75,32 @@ def message(call) -> str:
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_archive(name, tmp_path):
+def test_damaged_archive_raises_one_line(name, tmp_path):
     content, expected = DAMAGED[name]
     path = tmp_path / "x.npz"
     path.write_bytes(content)
-    line = message(lambda: read_table(path))
+    line = error_line(lambda: read_table(path))
     assert line.startswith(f"{path}: ") and expected in line
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_an_archive_by_another_name(suffix, tmp_path):
+def test_archive_with_another_suffix_is_an_error(suffix, tmp_path):
     path = tmp_path / f"x{suffix}"
     path.write_bytes(WHOLE)
-    assert message(lambda: read_table(path)).startswith(f"{path}: cannot be read: ")
+    assert error_line(lambda: read_table(path)).startswith(f"{path}: cannot be read: ")
 
 
-def test_half_of_a_complex_number_is_not_dropped(tmp_path):
+def test_complex_numbers_are_refused(tmp_path):
     path = tmp_path / "x.npz"
     path.write_bytes(archive(t=np.array([1.0 + 1.0j])))
     table = read_table(path)
-    assert "is not a number" in message(lambda: table.finite_numbers(["t"], 1, "x"))
+    assert "is not a number" in error_line(lambda: table.finite_numbers(["t"], 1, "x"))
 
 
-def test_no_column_is_dropped_for_its_name(tmp_path):
+def test_names_that_differ_only_in_spaces_are_refused(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a, a\n1,2\n")
-    assert "differ only in spaces" in message(lambda: read_table(path))
+    assert "differ only in spaces" in error_line(lambda: read_table(path))
 
 
 def log_file(folder, **changes: float):
@@ -115,9 +115,9 @@ def log_file(folder, **changes: float):
 
 @pytest.mark.parametrize("name", ["t", "f_x", "tau_y", "s_z", "omega_x", "alpha_y"])
 @pytest.mark.parametrize("value", [1e300, -1e26])
-def test_what_is_beyond_all_units(name, value, tmp_path):
+def test_value_beyond_all_units_is_refused(name, value, tmp_path):
     path = log_file(tmp_path, **{name: value})
-    line = message(lambda: read_log(path))
+    line = error_line(lambda: read_log(path))
     assert line.startswith(f"{path}:{name}: {value:g} in row 19 of log.csv is outside -1e+25 to")
 
 
@@ -131,9 +131,9 @@ def test_what_is_beyond_all_units(name, value, tmp_path):
         ("alpha_x", 2e9, "imu.angular_acceleration.columns: 2e+09 rad/s^2 in row 19"),
     ],
 )
-def test_what_no_sensor_measures(name, value, expected, tmp_path):
+def test_value_beyond_all_sensors_is_refused(name, value, expected, tmp_path):
     path = log_file(tmp_path, **{name: value})
-    assert f"{path}:{expected}" in message(lambda: read_log(path))
+    assert f"{path}:{expected}" in error_line(lambda: read_log(path))
     assert len(read_log(log_file(tmp_path, **{name: 0.45 * value}))) == 60
 
 
@@ -148,16 +148,16 @@ def test_what_no_sensor_measures(name, value, expected, tmp_path):
         ("pose: {time: {column: t, scale: 1e-300}}", ":pose.time.scale: "),
     ],
 )
-def test_a_description_beyond_all_units(change, expected, tmp_path):
+def test_description_beyond_all_units_is_refused(change, expected, tmp_path):
     path = tmp_path / "x.yaml"
     static = "static: {file: a.csv, force: {columns: [a]}, torque: {columns: [b]}, gravity:"
     static += " {columns: [c]}}"
     path.write_text(f"{static}\n{change}" if "gravity" in change else change)
-    assert expected in message(lambda: load_description(path))
+    assert expected in error_line(lambda: load_description(path))
 
 
 @pytest.mark.parametrize("rows", [2, 3])
-def test_a_record_that_is_too_short_to_be_thinned(rows, tmp_path):
+def test_record_too_short_to_be_thinned_is_refused(rows, tmp_path):
     path = tmp_path / "log.csv"
     table = np.outer(np.arange(rows) * 1e-3, np.ones(len(COLUMNS)))
     np.savetxt(path, table, delimiter=",", header=",".join(COLUMNS), comments="")
@@ -165,14 +165,14 @@ def test_a_record_that_is_too_short_to_be_thinned(rows, tmp_path):
     assert any("too few" in finding["message"] for finding in found)
 
 
-def test_a_wrench_of_rounding_tells_no_mass():
+def test_wrench_of_rounding_errors_determines_no_mass():
     motion = np.sin(np.outer(np.arange(100.0), 1.0 + np.arange(9)))
     wrench = 1e-150 * np.cos(np.outer(np.arange(100.0), 1.0 + np.arange(6)))
-    line = message(lambda: identify_batch(wrench, *np.split(motion, 3, axis=1)))
+    line = error_line(lambda: identify_batch(wrench, *np.split(motion, 3, axis=1)))
     assert "the mass cannot be identified" in line
 
 
-def test_channels_far_below_what_is_known_of_the_load():
+def test_channels_far_below_the_uncertainty_have_a_positive_floor():
     contact = np.tile([1e-5, 1e-5, 1e-5, 1e-5, 1e-6, 2e-7], (300, 1))
     known = np.diag(np.repeat([1.0, 0.0], [6, 10]))
     floor = fit_noise_floor(contact, *np.zeros((4, 300, 3)), known)
@@ -180,22 +180,22 @@ def test_channels_far_below_what_is_known_of_the_load():
 
 
 @pytest.mark.parametrize("delay", [1e300, -1e300, 5.0])
-def test_a_delay_beyond_the_record(delay, tmp_path):
-    line = message(lambda: identify_log(log_file(tmp_path), delay=delay))
+def test_delay_beyond_the_record_is_refused(delay, tmp_path):
+    line = error_line(lambda: identify_log(log_file(tmp_path), delay=delay))
     assert f"a delay of {delay:g} s leaves 0 of 60 samples" in line
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [("sigma", 1e308), ("sigma", np.nan), ("gamma", 1e308), ("gamma", -1.0)]
 )
-def test_scales_beyond_all_use(name, value, tmp_path):
+def test_scales_outside_0_to_100_are_refused(name, value, tmp_path):
     path = log_file(tmp_path)
     load = identify_log(path, delay=0.0).identification
-    line = message(lambda: eliminate_log(path, load, **{name: value}))
+    line = error_line(lambda: eliminate_log(path, load, **{name: value}))
     assert line == f"{name}: {value:g} is outside 0 to 100; give a scale, such as 0 or 1"
 
 
 @pytest.mark.parametrize("cutoff", [1e-300, np.nan])
-def test_a_low_pass_that_leaves_nothing(cutoff, tmp_path):
+def test_too_low_cutoff_is_refused(cutoff, tmp_path):
     path = log_file(tmp_path)
-    assert "Hz is too low" in message(lambda: identify_log(path, cutoff_hz=cutoff))
+    assert "Hz is too low" in error_line(lambda: identify_log(path, cutoff_hz=cutoff))

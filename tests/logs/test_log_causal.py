@@ -1,4 +1,4 @@
-"""The contact wrench from the past alone."""
+"""Contact wrench from past samples only."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ def test_the_low_pass_is_a_butterworth_of_second_order() -> None:
         assert gain == pytest.approx(1 / np.sqrt(1 + 3 * warped**4), rel=2e-3)
 
 
-def test_it_never_looks_ahead_and_starts_settled() -> None:
+def test_low_pass_is_causal_and_starts_settled() -> None:
     x = np.full((400, 6), 3.0)
     np.testing.assert_allclose(causal_low_pass(x, DT, CUTOFF), 3.0, rtol=1e-12)
-    kicked = x.copy()
-    kicked[200:] += 1
+    stepped = x.copy()
+    stepped[200:] += 1
     for ahead in (0.0, 0.01):
-        a, b = (causal_low_pass(v, DT, CUTOFF, ahead) for v in (x, kicked))
+        a, b = (causal_low_pass(v, DT, CUTOFF, ahead) for v in (x, stepped))
         np.testing.assert_array_equal(a[:200], b[:200])
         assert (b[200] != a[200]).all()
 
 
 @pytest.mark.parametrize(("delay", "wait"), [(0.0, 0), (0.0052, 6), (0.006, 6), (-0.004, 0)])
-def test_a_ramp_is_late_by_the_lag_or_not_at_all(delay: float, wait: int) -> None:
+def test_ramp_has_the_stated_lag_or_is_predicted(delay: float, wait: int) -> None:
     ramp = np.outer(np.arange(0, 2, DT), [1.0, 2, 3, 4, 5, 6])
     options = {"cutoff_hz": CUTOFF, "delay_s": delay}
     late = compute_causal_wrench(ramp, 2 * ramp, DT, mode="delayed", **options)
@@ -45,19 +45,19 @@ def test_a_ramp_is_late_by_the_lag_or_not_at_all(delay: float, wait: int) -> Non
     slope = np.array([1.0, 2, 3, 4, 5, 6])
     np.testing.assert_allclose((ramp - late.contact)[1000:] / slope, late.lag_s, rtol=1e-6)
     np.testing.assert_allclose(late.scaled, 2 * late.contact, atol=1e-12)
-    np.testing.assert_array_equal(late.contact[: wait + 1], 0.0)  # until the first has come
+    np.testing.assert_array_equal(late.contact[: wait + 1], 0.0)  # until the first sample arrives
     ahead = compute_causal_wrench(ramp, ramp, DT, mode="predicted", **options)
     np.testing.assert_allclose(ahead.contact[1000:], ramp[1000:], rtol=1e-6)
 
 
-def test_prediction_costs_as_much_noise_as_is_said() -> None:
+def test_prediction_increases_noise_by_the_stated_factor() -> None:
     noise = np.random.default_rng(5).normal(size=(200_000, 1))
     lag = filter_lag(DT, CUTOFF)
     plain, ahead = (causal_low_pass(noise, DT, CUTOFF, a).std() for a in (0.0, lag))
     assert ahead / plain == pytest.approx(np.sqrt(3), rel=0.04)
 
 
-def test_what_cannot_be_asked_for() -> None:
+def test_unusable_options_raise() -> None:
     x = np.zeros((50, 6))
     with pytest.raises(DrakeTeleopError, match="`predicted` needs a low-pass"):
         compute_causal_wrench(x, x, DT, cutoff_hz=None, delay_s=0.005, mode="predicted")

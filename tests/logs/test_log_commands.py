@@ -38,7 +38,7 @@ def simulated(
     delay_s: float = 0.0,
     sign: float = 1.0,
 ) -> Path:
-    """A canonical log, 4 s at 1 kHz, of a load PHI on a sensor with OFFSETS."""
+    """Write a canonical log, 4 s at 1 kHz, of a load PHI on a sensor with OFFSETS."""
     t = np.arange(0, 4, 1e-3)
     now, then = motion_at(t), motion_at(t - delay_s)
     wrench = non_contact_wrench(now.specific_force, now.omega, now.alpha, PHI) + OFFSETS
@@ -50,7 +50,7 @@ def simulated(
 
 
 def push(t: np.ndarray) -> np.ndarray:
-    """(N, 6) a contact in the last 1.2 s of 4."""
+    """Return (N, 6): a contact in the last 1.2 s of 4."""
     force = np.where(t > 2.8, 12 * np.sin(np.pi * (t - 2.8) / 1.2) ** 2, 0.0)
     return np.outer(force, [0.3, 0, -1, 0, 0.05, 0])
 
@@ -98,7 +98,7 @@ def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == ""
 
 
-def test_gains_that_are_stated_widen_the_deviations_of_an_imus_log(tmp_path: Path) -> None:
+def test_stated_gain_errors_increase_the_deviations_with_an_imu(tmp_path: Path) -> None:
     path = written(tmp_path, good(), pose=False)
     exact = identify_log(path).identification
     described = yaml.safe_load(path.read_text())
@@ -129,14 +129,14 @@ def test_rotation_about_one_axis_does_not_determine_the_inertias(tmp_path: Path)
     wrench += np.random.default_rng(3).normal(size=wrench.shape) * [0.1, 0.1, 0.1, 0.05, 0.05, 0.05]
     write_log(Log(t, wrench, s, omega, alpha), tmp_path / "log.parquet")
     found = identify_command(tmp_path / "log.parquet", tmp_path, delay=0.0, quiet=True)
-    # omega and alpha along y: only the middle column of the inertia acts.
+    # omega and alpha are along y: only the middle column of the inertia has an effect.
     assert {"I_xx", "I_xz", "I_zz"} <= set(found["not_identifiable"])
     assert {"m", "m c_x", "m c_z"} <= set(found["identifiable"])
     assert found["phi_std"][4] is None
 
 
 @pytest.mark.slow
-def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
+def test_eliminate_returns_the_contact(tmp_path: Path, load: Path) -> None:
     t = np.arange(0, 4, 1e-3)
     log = simulated(tmp_path / "log.parquet", contact=push(t), noise=0.1)
     summary = eliminate_command(log, load, tmp_path, quiet=True)
@@ -155,7 +155,7 @@ def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tare", [None, 0.5])
-def test_the_causal_wrench_knows_nothing_of_what_comes(
+def test_causal_wrench_is_independent_of_later_samples(
     tmp_path: Path, load: Path, tare: float | None
 ) -> None:
     t = np.arange(0, 4, 1e-3)
@@ -177,12 +177,12 @@ def test_the_causal_wrench_knows_nothing_of_what_comes(
     np.testing.assert_array_equal(before.scaled[past], after.scaled[past])
     expected = Identification.load(load).offsets if tare is None else OFFSETS
     np.testing.assert_allclose(after.offsets, expected, atol=0.02)
-    # Late by the filter's lag, and otherwise the push.
+    # The result is the push, delayed by the filter's lag.
     np.testing.assert_allclose(after.contact[3200:3400], push(t - after.lag_s)[3200:3400], atol=0.3)
 
 
 @pytest.mark.slow
-def test_a_start_to_tare_with_has_samples(tmp_path: Path, load: Path) -> None:
+def test_tare_requires_enough_samples(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet")
     for seconds in (1e-3, 9.0):
         with pytest.raises(DrakeTeleopError, match=r"causal_tare_s: the first .* of 4000 samples"):
@@ -251,7 +251,7 @@ def test_unusable_scales_of_weight_and_inertia_are_rejected(
 
 
 @pytest.mark.slow
-def test_eta_keeps_a_share_of_the_object(tmp_path: Path, load: Path) -> None:
+def test_eta_renders_a_fraction_of_the_object(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet")
     kept = eliminate_log(log, load, eta=0.25).scaled
     np.testing.assert_allclose(kept, eliminate_log(log, load, sigma=0.25).scaled, atol=1e-12)
@@ -262,7 +262,7 @@ def test_eta_keeps_a_share_of_the_object(tmp_path: Path, load: Path) -> None:
 
 
 @pytest.mark.slow
-def test_offsets_are_those_of_the_record(tmp_path: Path, load: Path) -> None:
+def test_offsets_are_estimated_from_the_record(tmp_path: Path, load: Path) -> None:
     drift = np.array([0.3, -0.2, 0.5, 0.01, 0.02, -0.01])
     log = simulated(tmp_path / "log.parquet", contact=np.tile(drift, (4000, 1)), noise=0.1)
     summary = eliminate_command(log, load, tmp_path, quiet=True)
@@ -272,7 +272,7 @@ def test_offsets_are_those_of_the_record(tmp_path: Path, load: Path) -> None:
 
 
 @pytest.mark.slow
-def test_delay_of_the_load_file_where_the_record_has_none(tmp_path: Path, load: Path) -> None:
+def test_delay_of_the_load_file_is_used_at_rest(tmp_path: Path, load: Path) -> None:
     t = np.arange(0, 2, 1e-3)
     rest = np.zeros((len(t), 3))
     s = rest + np.array([0, 0, 9.81])
@@ -298,7 +298,7 @@ def test_robust_offsets_ignore_a_contact() -> None:
     ("text", "words"),
     [(None, "cannot be read"), ("{", "is not JSON"), ("{}", "phi"), ('{"phi": [1, 2]}', "phi")],
 )
-def test_bad_load_files(tmp_path: Path, text: str | None, words: str) -> None:
+def test_invalid_load_file_raises(tmp_path: Path, text: str | None, words: str) -> None:
     log, load_file = simulated(tmp_path / "log.parquet"), tmp_path / "load.json"
     if text is not None:
         load_file.write_text(text)
@@ -308,7 +308,7 @@ def test_bad_load_files(tmp_path: Path, text: str | None, words: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_foreign_table_is_told_what_to_do(tmp_path: Path) -> None:
+def test_error_of_a_table_of_others_has_a_remedy(tmp_path: Path) -> None:
     pl.DataFrame({"time": [0.0, 0.1], "fx": [1.0, 2.0]}).write_csv(tmp_path / "log.csv")
     with pytest.raises(
         DrakeTeleopError, match=r"log\.csv: is not a canonical log.*`drake-teleop insp"
@@ -427,7 +427,7 @@ def test_ntnu_poses_give_mass_centre_and_offsets(
     summary = identify_command(describe_poses(tmp_path, ntnu, pose), tmp_path, quiet=True)
     assert summary["mass"] == pytest.approx(0.93231, abs=5e-6)
     assert summary["com"][2] == pytest.approx(0.043896, abs=5e-7)
-    # The README's offsets are of the sensor's own sign, ours of Eq. (1).
+    # The README's offsets have the sensor's own sign, this result that of Eq. (1).
     readings = [9.0765, -1.0181, 9.9848, 0.4325, -0.6916, -0.1570]
     np.testing.assert_allclose(summary["offsets"], -np.array(readings), atol=6e-5)
     assert summary["not_identifiable"] == NAMES_OF_INERTIA
@@ -454,8 +454,8 @@ def test_ntnu_records_without_their_non_contact_force(
     assert summary["residual_rms"] <= residual
     assert summary["gravity_only_rms"] == pytest.approx(gravity_only, abs=0.02)
     assert np.abs(summary["tare"][:3]).max() < 0.5
-    # A hammer taps the robot four times in the second record, which touches nothing either. One of
-    # the taps shakes it more than the rest of the record lets expect.
+    # A hammer taps the robot four times in the second record, which has no contact either. One tap
+    # disturbs it more than the noise of the record predicts.
     assert [round(c["start_s"], 1) for c in summary["contacts"]] == (
         [4.2] if record == "2-vibrations" else []
     )
@@ -463,7 +463,7 @@ def test_ntnu_records_without_their_non_contact_force(
     own = identify_command(log, tmp_path / "own", quiet=True)
     assert own["not_identifiable"] == NAMES_OF_INERTIA
     assert own["delay_s"] == pytest.approx(0.006, abs=0.001)
-    # The hammer of the second record bends nothing.
+    # The hammer causes no contact.
     assert own["mass"] == pytest.approx(0.93231, rel=0.005)
     assert own["physically_consistent"]
     assert own["com"][2] == pytest.approx(0.0439, abs=3e-4)

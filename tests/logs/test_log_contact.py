@@ -1,4 +1,4 @@
-"""Contacts in a record, told from its own noise though they are in it."""
+"""Contacts in a record, detected with the noise floor of the same record."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ DT, CUTOFF = 2e-3, 30.0
 STD = np.array([0.2, 0.3, 0.4, 0.02, 0.03, 0.04])
 
 
-def quiet(seed: int, n: int = 6000) -> np.ndarray:
+def noise_of(seed: int, n: int = 6000) -> np.ndarray:
     return STD * np.random.default_rng(seed).normal(size=(n, 6))
 
 
-def detected(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) -> Detection:
-    """At rest."""
+def detect(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) -> Detection:
+    """Return the detection for a contact wrench of a sensor at rest."""
 
-    def at_rest(wrench: np.ndarray) -> DetectorSamples:
+    def samples_at_rest(wrench: np.ndarray) -> DetectorSamples:
         still, up = np.zeros((len(wrench), 3)), np.tile([0.0, 0.0, 9.81], (len(wrench), 1))
         return DetectorSamples(wrench, up, still, still, still)
 
-    calm = None if free is None else (at_rest(free), dt)
-    found = detect_contact(at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
+    calm = None if free is None else (samples_at_rest(free), dt)
+    found = detect_contact(samples_at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
     assert found is not None
     return found
 
 
-def test_the_noise_floor_is_that_of_the_quiet_part() -> None:
-    contact = quiet(1)
+def test_noise_floor_excludes_contact() -> None:
+    contact = noise_of(1)
     np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
     contact[3500:] += 5.0 + 3 * np.sin(np.linspace(0, 9, 2500))[:, None]
     np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
@@ -45,13 +45,13 @@ def test_the_noise_floor_is_that_of_the_quiet_part() -> None:
 
 
 def test_contacts_have_their_times_and_peaks() -> None:
-    contact = quiet(2)
+    contact = noise_of(2)
     t = 10 + DT * np.arange(len(contact))
     force = np.zeros(len(t))
     force[1000:1300] = 12.0 * np.sin(np.linspace(0, 2 * np.pi, 300))  # changes its sign
     force[4000:4001] = 40.0
     contact[:, 2] += force
-    swing, knock = summarize_contacts(t, contact, detected(contact).touched)
+    swing, knock = summarize_contacts(t, contact, detect(contact).touched)
     assert swing["start_s"] == pytest.approx(12.0, abs=0.05)
     assert swing["stop_s"] == pytest.approx(12.6, abs=0.05)
     assert swing["peak_N"] == pytest.approx(12.0, abs=1.5)
@@ -62,14 +62,14 @@ def test_contacts_have_their_times_and_peaks() -> None:
 
 @pytest.mark.parametrize("memory", [0.0, 0.2])
 def test_noise_is_no_contact(memory: float) -> None:
-    """Records of a minute, each with its own noise floor."""
+    """Each of several records of a minute has its own noise floor."""
     rate, n = 200.0, 12_000
     rng = np.random.default_rng(7)
     decay = np.exp(-1 / (rate * memory)) if memory else 0.0
     for _ in range(2):
         noise = lfilter([1.0], [1.0, -decay], rng.normal(size=(n + 400, 6)), axis=0)[400:]
         contact = low_pass(STD * noise, 1 / rate, CUTOFF)
-        assert not detected(contact - contact.mean(axis=0), 1 / rate).touched.any()
+        assert not detect(contact - contact.mean(axis=0), 1 / rate).touched.any()
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_noise_is_no_contact(memory: float) -> None:
 def test_the_threshold_does_not_rise_with_the_contacts(
     share: float, count: int, slow: bool
 ) -> None:
-    """Contact in up to 40 %, at once or many times, and rising slowly, sets no other threshold."""
+    """Contact lasts up to 40 %, at once, repeatedly or slowly rising."""
     n = 10_000
-    noise = low_pass(quiet(3, n), DT, CUTOFF)
+    noise = low_pass(noise_of(3, n), DT, CUTOFF)
     push, length = np.zeros(n), share * n / count
     for k in range(count):
         middle = (k + 0.5) * n / count
@@ -90,7 +90,7 @@ def test_the_threshold_does_not_rise_with_the_contacts(
         push[rows] = (2.0 + k) * rise
     contact = noise.copy()
     contact[:, 2] += push
-    found, free = detected(contact), detected(contact, free=noise)
+    found, free = detect(contact), detect(contact, free=noise)
     assert found.threshold < 1.6 / 1.25 * 1.2 * free.threshold
     # 0.13 N of noise hide 1 N.
     assert found.touched[push > 1.4].all()
@@ -98,20 +98,20 @@ def test_the_threshold_does_not_rise_with_the_contacts(
     assert len(summarize_contacts(DT * np.arange(n), contact, found.touched)) == count
 
 
-def test_more_contact_than_can_be_told_is_noted() -> None:
-    contact = low_pass(quiet(4), DT, CUTOFF)
-    assert detected(contact).notes == ()
+def test_note_reports_too_much_contact() -> None:
+    contact = low_pass(noise_of(4), DT, CUTOFF)
+    assert detect(contact).notes == ()
     much = contact.copy()
     much[1000:3700] += 20 * STD
-    assert "45 % of the record" in detected(much).notes[0]
-    assert "--free" in detected(much).notes[0]
-    most = contact.copy()  # of the record: it passes for the noise
+    assert "45 % of the record" in detect(much).notes[0]
+    assert "--free" in detect(much).notes[0]
+    most = contact.copy()  # most of the record counts as noise
     most[800:] += 40 * STD * np.sin(np.arange(5200) * 0.05)[:, None]
-    assert "most of the record may be in contact" in detected(most).notes[0]
-    assert detected(most, free=contact).notes == ()
-    assert detected(most, free=contact).touched[900:-50].mean() > 0.9
+    assert "most of the record may be in contact" in detect(most).notes[0]
+    assert detect(most, free=contact).notes == ()
+    assert detect(most, free=contact).touched[900:-50].mean() > 0.9
 
 
-def test_a_record_that_is_too_short_says_nothing() -> None:
-    rows = DetectorSamples(quiet(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
+def test_record_that_is_too_short_has_no_result() -> None:
+    rows = DetectorSamples(noise_of(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
     assert detect_contact(rows, DT, CUTOFF, np.zeros((16, 16)), STD) is None

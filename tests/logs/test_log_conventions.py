@@ -1,4 +1,4 @@
-"""Errors of convention in real records and in many simulated ones; what `identify` says of them."""
+"""Errors of convention in real and simulated records, and what `identify` reports about them."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_an_error_in_a_real_record_is_named(
     path.write_text(yaml.safe_dump(data))
     summary = inspect_command(path, tmp_path, quiet=True)
     found = {entry["name"]: entry["message"] for entry in summary["findings"]}
-    assert set(found) - {"lag"} == {name}  # The record's own lag may be named as well.
+    assert set(found) - {"lag"} == {name}  # The lag of the record itself may be named as well.
     assert says in found[name]
     if name == "clock":
         try:
@@ -184,11 +184,11 @@ def test_a_short_contact_on_a_light_load_is_no_alarm(tmp_path: Path) -> None:
     assert findings(tmp_path, columns) == {}
 
 
-def test_the_rate_of_a_held_sensor_is_told(tmp_path: Path) -> None:
+def test_rate_of_a_held_sensor_is_reported(tmp_path: Path) -> None:
     columns = good()
     planted.held(columns)
     found = findings(tmp_path, columns)
-    assert set(found) == {"repeated rows", "lag"}  # A held value is late by half its time.
+    assert set(found) == {"repeated rows", "lag"}  # A held value is late by half of its period.
     assert "held for 5 rows: new values come at 100 Hz, not 500 Hz" in found["repeated rows"]
     assert "4.0 ms ahead" in found["lag"]
 
@@ -203,7 +203,7 @@ def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     assert "repeated rows" not in findings(tmp_path, columns)
 
 
-def test_the_remedy_for_a_drifting_clock_is_right(tmp_path: Path) -> None:
+def test_remedy_for_a_drifting_clock_is_correct(tmp_path: Path) -> None:
     columns = good()
     planted.drifting_clock(columns)
     path = written(tmp_path, columns)
@@ -229,7 +229,7 @@ def test_the_remedy_for_a_drifting_clock_is_right(tmp_path: Path) -> None:
         (planted.clock, "imu.time.offset: -0.300"),
     ],
 )
-def test_identify_refuses_a_worthless_result_and_says_why(
+def test_identify_refuses_a_useless_result_with_the_reason(
     tmp_path: Path, plant: Callable[[planted.Columns], None], says: str
 ) -> None:
     columns = good()
@@ -266,14 +266,14 @@ def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
         ("No9_Singularity_Free_ForceSensor", "log_force_sensor", 0.11),
     ],
 )
-def test_the_clock_of_a_ur5_imu(
+def test_delay_and_drift_of_a_ur5_imu_are_found(
     ur5: Path, tmp_path: Path, move: str, force: str | None, lag_s: float
 ) -> None:
     def stream(name: str, unit: str) -> dict[str, Any]:
         file = str(ur5 / f"{move}__{name}.csv")
         return {"file": file, "header": False, "time": {"column": 0, "unit": unit}}
 
-    # The force sensor was not connected in the first record: other columns stand in for it.
+    # The force sensor was not connected in the first record: other columns replace it.
     wrench = stream(force, "s") if force else stream("acc_data", "ms")
     first = [1, 2, 3] if force else [4, 5, 6]
     torque = [4, 5, 6]
@@ -289,7 +289,7 @@ def test_the_clock_of_a_ur5_imu(
     summary = inspect_command(tmp_path / "log.yaml", tmp_path, quiet=True)
     found = {x["name"]: x["message"] for x in summary["findings"]}
     assert summary["mounting"]["lag_s"] == pytest.approx(lag_s, abs=0.01)
-    assert "imu.time.scale: 0.99" in found["clock"]  # The clocks drift by some ms each second.
+    assert "imu.time.scale: 0.99" in found["clock"]  # The clocks drift by several ms per second.
     if force:
         assert "payload not identifiable" in found["payload"]
         assert "new values come at 20" in found["repeated rows"]
@@ -299,7 +299,7 @@ def test_the_clock_of_a_ur5_imu(
 
 
 @pytest.mark.parametrize("time", [{"column": "t"}, {"rate": 1000.0}, None])
-def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
+def test_log_is_thinned_to_means_for_any_form_of_time(
     time: dict[str, Any] | None,
 ) -> None:
     t = np.arange(900) * 1e-3
@@ -313,7 +313,7 @@ def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
         streams = {"static": wrench | {"gravity": {"columns": ["s"]}}}
     description = Description.model_validate(streams)
     log = LogData(description, "log.yaml", {Path("w"): table}).read_thinned_log(description)
-    if time is None:  # of poses there are few, and none follows another
+    if time is None:  # poses are few and independent
         assert log.static and len(log) == 900
     else:
         np.testing.assert_allclose(np.diff(log.t), 0.009, atol=1e-12)
@@ -342,7 +342,7 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
         return SimpleNamespace(findings=(reason,))
 
     load: Any = SimpleNamespace(mass=1.0, identifiable=np.ones(16, bool))
-    # Of a residual that is this share of the wrench's standard deviation everywhere.
+    # This fraction of the wrench's standard deviation remains in all channels.
     predicted = (1 - np.sqrt(left)) * wrench
     if refused:
         with pytest.raises(DrakeTeleopError, match=refused):

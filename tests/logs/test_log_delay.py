@@ -65,7 +65,7 @@ def test_delay_outside_the_search_range_is_none() -> None:
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.0])
-def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float) -> None:
+def test_independent_samples_are_those_of_the_pass_band(start: float) -> None:
     t = start + np.arange(0, 4, 2e-3)
     motion = motion_at(t - start)
     wrench = non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
@@ -75,7 +75,7 @@ def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float)
     assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
 
 
-def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
+def test_poses_at_rest_are_independent_and_give_the_mass() -> None:
     s = 9.81 * Rotation.random(30, random_state=2).apply([0.0, 0.0, 1.0])
     rest = np.zeros((30, 3))
     wrench = non_contact_wrench(s, rest, rest, PHI) + 3.0
@@ -84,6 +84,6 @@ def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
     assert fit.independent_samples == 30 - 8
 
 
-def test_a_good_fit_explains_most_and_has_a_mass() -> None:
+def test_good_fit_has_a_small_residual_and_a_positive_mass() -> None:
     assert LoadFit(0.001, 1.0).is_good
     assert not LoadFit(0.9, 1.0).is_good and not LoadFit(0.001, -1.0).is_good

@@ -26,7 +26,7 @@ OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
 
 
 def log_with_push(path: Path, push: np.ndarray, seed: int) -> Path:
-    """8 s of turning and shaking; the environment pushes the tool's tip from 5 s to 6 s."""
+    """Write 8 s of rotation and vibration; the environment pushes the tip from 5 s to 6 s."""
     t = np.arange(0.0, 8.0, 2e-3)
     rng = np.random.default_rng(seed)
 
@@ -39,7 +39,7 @@ def log_with_push(path: Path, push: np.ndarray, seed: int) -> Path:
     wrench = OFFSETS + non_contact_wrench(s, omega, alpha, TOOL)
     wrench += rng.normal(size=wrench.shape) * np.repeat([0.1, 0.004], 3)
     pressed = (t >= 5.0) & (t < 6.0)
-    # What the environment exerts, the sensor need not: F_c = -F_env.
+    # The wrench is that of the sensor on the tool: F_c = -F_env.
     wrench[pressed] -= np.r_[push, np.cross([0.0, 0.0, 0.2], push)]
     write_log(Log(t, wrench, s, omega, alpha), path)
     return path
@@ -68,7 +68,7 @@ def test_a_push_is_found_with_its_direction_and_place(tmp_path: Path, statistic:
     assert f"{touch['start_s']:.3f}" in result.output
 
 
-def test_free_motion_of_the_log_itself_and_its_own_load(tmp_path: Path) -> None:
+def test_log_without_load_and_free_record_uses_its_own(tmp_path: Path) -> None:
     log = log_with_push(tmp_path / "log.parquet", np.array([3.0, 0.0, 0.0]), 3)
     summary = detect_command(log, tmp_path, delay=0.0, quiet=True)
     (touch,) = summary["contacts"]
@@ -78,7 +78,7 @@ def test_free_motion_of_the_log_itself_and_its_own_load(tmp_path: Path) -> None:
 
 
 def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_path: Path) -> None:
-    """A push of 20 N that rises slowly, for a third of the record."""
+    """A push of 20 N rises slowly and lasts a third of the record."""
     free = log_with_push(tmp_path / "free.parquet", np.zeros(3), 1)
     load = tmp_path / "identification.json"
     identify_log(free, delay=0.0).identification.save(load)
@@ -98,7 +98,7 @@ def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_p
     assert start == pytest.approx(start_known, abs=0.03)
     assert 4.0 < start < 4.12
     assert known.notes == ()
-    # Pressed most of the time: the record's offsets are those of the contact, and that is said.
+    # Contact during most of the record also shifts its offsets, and a note states this.
     pushed = pl.when((pl.col("t") > 2.0) & (pl.col("t") < 7.5)).then(6.0).otherwise(0.0)
     most = tmp_path / "most.parquet"
     table.with_columns(f_y=pl.col("f_y") - pushed).write_parquet(most)
@@ -124,8 +124,8 @@ def test_poses_and_unknown_statistics_are_refused(ntnu: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("statistic", ["level", "cusum", "glr"])
-def test_ntnu_hammer_is_not_taken_for_contact(ntnu: Path, tmp_path: Path, statistic: str) -> None:
-    """The threshold is of the calm record; in the other, the robot is hit with a hammer."""
+def test_ntnu_hammer_is_not_detected_as_contact(ntnu: Path, tmp_path: Path, statistic: str) -> None:
+    """The threshold is that of the calm record; in the other, a hammer hits the robot."""
     load = tmp_path / "identification.json"
     identify_log(describe_poses(tmp_path, ntnu, GRAVITY)).identification.save(load)
     calm, shaken = (describe_record(tmp_path, ntnu, r) for r in ("1-baseline", "2-vibrations"))
@@ -133,9 +133,9 @@ def test_ntnu_hammer_is_not_taken_for_contact(ntnu: Path, tmp_path: Path, statis
     found = detect_command(shaken, tmp_path / "shaken", free=calm, **options)
     assert found["above_threshold"] <= 0.009
     assert found["above_force_threshold"]["raw"] > 0.85
-    # The same threshold for all motions is exceeded more often.
+    # A threshold that is equal for all motions is exceeded more often.
     assert found["above_force_threshold"]["eliminated"] > 2 * found["above_threshold"]
-    # The other way round, so that the record is not judged by itself.
+    # In reverse, so that no record sets its own threshold.
     calm_again = detect_command(calm, tmp_path / "calm", free=shaken, **options)
     assert calm_again["above_threshold"] == 0.0
     itself = detect_command(calm, tmp_path / "itself", free=calm, **options)
@@ -143,15 +143,15 @@ def test_ntnu_hammer_is_not_taken_for_contact(ntnu: Path, tmp_path: Path, statis
     assert itself["above_force_threshold"]["raw"] > 0.85
 
 
-def lacking(summary: dict[str, Any], path: str = "") -> list[str]:
-    """Names of what is left of the force without a name of what is left of the torque."""
+def missing(summary: dict[str, Any], path: str = "") -> list[str]:
+    """Return force residuals in a summary that have no counterpart of the torque."""
     left = re.compile("residual|rms|peak")
     names = []
     for name, value in summary.items():
         if isinstance(value, dict):
-            names += lacking(value, f"{path}{name}.")
+            names += missing(value, f"{path}{name}.")
         elif left.search(name) and not isinstance(value, list) and "torque" not in name:
-            if name.endswith("per_channel"):  # or null
+            if name.endswith("per_channel"):  # may be null
                 continue
             start, _, end = name.rpartition("_")
             twins = {f"{start}_torque_{end}", name.replace("force", "torque")}
@@ -161,13 +161,13 @@ def lacking(summary: dict[str, Any], path: str = "") -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_torque_is_not_forgotten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_force_residuals_have_torques(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = log_with_push(tmp_path / "log.parquet", np.zeros(3), 1)
     identified = identify_command(log, tmp_path, delay=0.0)
     options = {"causal": "delayed", "delay": 0.0}
     eliminated = eliminate_command(log, tmp_path / "identification.json", tmp_path / "e", **options)
-    assert lacking(identified) == [] and lacking(eliminated) == []
-    assert lacking({"residual_rms_force": 1.0}) == ["residual_rms_force"]  # it can fail
+    assert missing(identified) == [] and missing(eliminated) == []
+    assert missing({"residual_rms_force": 1.0}) == ["residual_rms_force"]
     printed = capsys.readouterr().out.replace("\n", " ")
     for words in ("residual", "largest contact force", "causal: "):
         _, _, rest = printed.partition(words)

@@ -1,4 +1,4 @@
-"""The sample log with a sensor that is not connected, or a clock that is coarse."""
+"""Sample logs of a sensor that is not connected, or with a coarse clock."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from drake_teleop.logs.sample import sample_log_command
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory):
-    """A sample log, to be spoilt."""
+def sample_tables(tmp_path_factory):
+    """Return a folder and the tables of a sample log, to be damaged."""
     folder = tmp_path_factory.mktemp("sample")
     sample_log_command(folder, quiet=True)
     return folder, pl.read_csv(folder / "free_wrench.csv"), pl.read_csv(folder / "free_pose.csv")
@@ -24,9 +24,9 @@ def tables(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("wrench_ms", "pose_ms"), [(100, 0), (200, 0), (0, 100), (100, 100)])
-def test_the_load_is_identified_though_the_stamps_are_coarse(tables, wrench_ms, pose_ms):
-    """What questions the fit thins the rows, and their stamps, too."""
-    folder, wrench, pose = tables
+def test_load_is_identified_with_coarse_stamps(sample_tables, wrench_ms, pose_ms):
+    """Checks of the fit use thinned rows and stamps."""
+    folder, wrench, pose = sample_tables
     if wrench_ms:
         wrench = wrench.with_columns((pl.col("time") / wrench_ms).floor() * wrench_ms)
     if pose_ms:
@@ -40,8 +40,8 @@ def test_the_load_is_identified_though_the_stamps_are_coarse(tables, wrench_ms, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [DrakeTeleopError, OverflowError, np.linalg.LinAlgError])
-def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
-    folder, wrench, pose = tables
+def test_failing_check_does_not_stop_identify(sample_tables, error, monkeypatch):
+    folder, wrench, pose = sample_tables
     wrench.write_csv(folder / "free_wrench.csv")
     pose.write_csv(folder / "free_pose.csv")
 
@@ -57,9 +57,9 @@ def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
 @pytest.mark.parametrize("change", [0.0, 1e-9])
 @pytest.mark.parametrize("value", [3.5, -1e4, 0.0])
 @pytest.mark.slow
-def test_a_wrench_that_never_changes_is_said_to(tables, change, value):
-    """By a sensor that is not connected, whose driver repeats one value."""
-    folder, wrench, pose = tables
+def test_constant_wrench_is_reported(sample_tables, change, value):
+    """The driver of a sensor that is not connected repeats one value."""
+    folder, wrench, pose = sample_tables
     names = [name for name in wrench.columns if name != "time"]
     noise = change * np.random.default_rng(0).normal(size=len(wrench))
     same = wrench.with_columns(*(pl.Series(name, value + value * noise) for name in names))

@@ -38,7 +38,7 @@ OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.0
 
 
 def simulated(path: Path, phi: np.ndarray, seed: int, contact: np.ndarray | None = None) -> Path:
-    """A canonical log, 4 s at 500 Hz, with noise and offsets."""
+    """Write a canonical log, 4 s at 500 Hz, with noise and offsets."""
     t = np.arange(0, 4, 2e-3)
     motion = motion_at(t)
     kinematics = motion.specific_force, motion.omega, motion.alpha
@@ -52,9 +52,9 @@ def simulated(path: Path, phi: np.ndarray, seed: int, contact: np.ndarray | None
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where docs/theory.md's commands were typed.
+    """Return the folder in which the commands of docs/theory.md have been run.
 
-    gripper/identification.json, total/ with identification.json and object.json, out/eliminate.
+    Results: gripper/identification.json, total/ with object.json as well, and out/eliminate.
     """
     folder = tmp_path_factory.mktemp("gripper")
     push = np.zeros((2000, 6))
@@ -93,17 +93,17 @@ def test_identify_writes_the_object(files: Path) -> None:
 
 
 @pytest.mark.slow
-def test_half_of_the_object_and_the_push_are_left(files: Path) -> None:
+def test_result_is_half_of_the_object_plus_the_push(files: Path) -> None:
     summary = json.loads((files / "out" / "eliminate" / "summary.json").read_text())
     (push,) = summary["contacts"]
     assert push["peak_N"] == pytest.approx(20.0, rel=0.1)
-    # The zero-phase low-pass of 30 Hz spreads it by some 30 ms.
+    # The zero-phase low-pass of 30 Hz widens it by about 30 ms.
     assert 1.95 < push["start_s"] < 2.02 and 2.38 < push["stop_s"] < 2.45
     assert summary["eta"] == 0.5
 
 
 @pytest.mark.slow
-def test_the_table_has_the_object_only_with_a_gripper(
+def test_table_has_columns_of_the_object_only_with_a_gripper(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, gripper = files / "total.parquet", files / "gripper" / "identification.json"
@@ -116,7 +116,7 @@ def test_the_table_has_the_object_only_with_a_gripper(
 
 
 @pytest.mark.slow
-def test_nothing_gripped_is_said(files: Path, tmp_path: Path) -> None:
+def test_note_reports_a_gripper_without_object(files: Path, tmp_path: Path) -> None:
     gripper = files / "gripper" / "identification.json"
     log = simulated(tmp_path / "empty.parquet", GRIPPER, 8)
     summary = identify_command(log, tmp_path / "out", gripper=gripper, delay=0.0, quiet=True)
@@ -135,16 +135,16 @@ def test_eta_splits_gripper_and_object(files: Path) -> None:
     np.testing.assert_allclose(found.scaled, found.contact + kept, atol=1e-9)
     by_hand = eliminate_log(log, load, sigma=0.0, sigma_object=0.5, **options)
     np.testing.assert_array_equal(by_hand.scaled, found.scaled)
-    # The truth: half of the object's own non-contact wrench, and nothing of the gripper's.
+    # Truth: half of the non-contact wrench of the object, without that of the gripper.
     truth = 0.5 * non_contact_wrench(*found.log.motion, OBJECT)
     assert np.sqrt(np.mean((found.scaled - truth)[:, :3] ** 2)) < 0.12
-    # Everything kept is the measurement, whatever the split.
+    # With all scales at 1 the result is the measurement, for any split.
     whole = eliminate_log(log, load, sigma=1.0, **options)
     np.testing.assert_allclose(whole.scaled, whole.measured, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_scales_that_do_not_go_together(files: Path) -> None:
+def test_incompatible_scales_raise(files: Path) -> None:
     load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
     log = files / "total.parquet"
     with pytest.raises(DrakeTeleopError, match=r"sigma_object.*gripper"):
@@ -166,7 +166,7 @@ def test_exchanged_files_are_an_error_in_both_commands(files: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_path: Path) -> None:
+def test_eliminate_with_gripper_has_contacts_and_causal_wrench(files: Path, tmp_path: Path) -> None:
     t = np.arange(0, 4, 2e-3)
     force = np.where((t > 2.0) & (t < 2.5), 12 * np.sin(2 * np.pi * (t - 2.0)) ** 2, 0.0)
     touch = np.outer(force, [0.3, 0, -1, 0, 0.05, 0])
@@ -188,7 +188,7 @@ def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_pat
     assert table["in_contact"].mean() == summary["in_contact"]
     assert summary["causal"]["mode"] == "delayed"
     assert summary["causal"]["lag_s"] == pytest.approx(0.0098, abs=2e-4)
-    # The same force, later by the lag: 4 samples at 500 Hz.
+    # The same force, delayed by the lag: 4 samples at 500 Hz.
     shifted = np.abs(late[4:, 2] - contact[:-4, 2]).max()
     assert shifted < 0.35 < 0.4 < np.abs(late[:, 2] - contact[:, 2]).max()
     ahead = eliminate_log(log, load, causal="predicted", delay=0.0).causal

@@ -1,4 +1,4 @@
-"""Errors planted one at a time into a good log are named; a good log raises none."""
+"""Planted errors are named one at a time; a good log has no findings."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
 
 
 @pytest.mark.parametrize("streams", [{}, {"imu": False}, {"pose": False}])
-def test_nothing_is_suspected_in_a_good_log(tmp_path: Path, streams: dict[str, bool]) -> None:
+def test_good_log_has_no_finding(tmp_path: Path, streams: dict[str, bool]) -> None:
     assert findings(tmp_path, good(), **streams) == {}
 
 
@@ -74,7 +74,7 @@ def test_nothing_is_suspected_in_a_good_log(tmp_path: Path, streams: dict[str, b
     PLANTED,
     ids=["-".join([p[0].__name__.strip("_"), *p[3]]) for p in PLANTED],
 )
-def test_a_planted_error_is_named_and_no_other(
+def test_only_the_planted_error_is_named(
     tmp_path: Path,
     plant: Callable[[Columns], None],
     name: str,
@@ -98,7 +98,7 @@ def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
     assert "[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]" in found["swapped axes"]
 
 
-def test_rows_that_were_written_twice_are_named(tmp_path: Path) -> None:
+def test_repeated_rows_are_named(tmp_path: Path) -> None:
     found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
     assert set(found) == {"clock jump", "repeated rows"}
     assert "every value is held for 2 rows" in found["repeated rows"]
@@ -118,7 +118,7 @@ def test_a_lag_of_6_ms_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("deviation", "names"), [(0.001, set()), (0.0005, {"lag"})])
-def test_a_lag_counts_from_five_standard_deviations(
+def test_lag_below_five_standard_deviations_is_not_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float, names: set[str]
 ) -> None:
     path = written(tmp_path, good())
@@ -139,7 +139,7 @@ def test_an_inverse_orientation_is_read(tmp_path: Path) -> None:
     assert inspect_command(path, tmp_path / "out", quiet=True)["findings"] == []
 
 
-def test_an_unknown_table_gets_a_draft(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_drafts_a_description(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     c = good()
     data = {"stamp": (c["t"] * 1e6).astype(np.int64), "status": np.zeros(len(c["t"]))}
     for key, x in (("F", c["force"]), ("T", c["torque"]), ("acc_", c["s"]), ("w", c["omega"])):
@@ -162,7 +162,7 @@ def test_an_unknown_table_gets_a_draft(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
-    """A good log as others write it: its columns, and what stands between them."""
+    """Return the columns of a good log in a format of others, and their separator."""
     wrench = np.hstack([c["force"], c["torque"]])
     R, q = c["R"], quaternions(c["R"])
     if form == "rtde":  # base axes, the pose as position and rotation vector
@@ -217,9 +217,7 @@ def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
         *((name, 1) for name in ("franka", "units", "arrays", "matlab", "topics")),
     ],
 )
-def test_a_draft_of_what_robots_write_is_right_as_it_stands(
-    tmp_path: Path, form: str, sign: int
-) -> None:
+def test_draft_for_tables_of_robots_needs_no_change(tmp_path: Path, form: str, sign: int) -> None:
     columns, separator = as_written(form, good())
     if separator:
         pl.DataFrame(columns).write_csv(table := tmp_path / "table.csv", separator=separator)
@@ -241,8 +239,8 @@ def test_a_draft_of_what_robots_write_is_right_as_it_stands(
     )
 
 
-def test_a_draft_leaves_alone_what_it_has_no_use_for(tmp_path: Path) -> None:
-    """A large Parquet file reads a column whenever it is asked for one."""
+def test_drafting_reads_only_the_required_columns(tmp_path: Path) -> None:
+    """Each access reads a column of a large Parquet file."""
     asked = set()
 
     class Columns(UserDict[str, np.ndarray]):
@@ -256,8 +254,8 @@ def test_a_draft_leaves_alone_what_it_has_no_use_for(tmp_path: Path) -> None:
     assert asked <= {"t", "Fx", "Tx"}
 
 
-def test_each_stream_of_a_draft_has_the_time_that_goes_with_it(tmp_path: Path) -> None:
-    """In its structure, whatever has as many rows elsewhere; or else of its length."""
+def test_each_stream_of_a_draft_has_its_own_time(tmp_path: Path) -> None:
+    """The time is in the same structure, or else has the same number of rows."""
     t, short, x = np.arange(60) * 0.01, np.arange(20) * 0.03, np.ones((60, 3))
     ft, imu = {"F": x, "M": x, "t": t}, {"acc": x, "gyro": x, "time": t}
     pose = {"p": x[:20], "q": np.ones((20, 4))}
@@ -282,8 +280,8 @@ def test_an_array_that_is_not_recognized_is_named_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("first", ["0.00,1.5,0,0,0", "0.00,0,0,nan,1e-3"])
-def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) -> None:
-    """Its first row of numbers is no row of names, nor lost."""
+def test_table_without_names_keeps_its_first_row(tmp_path: Path, first: str) -> None:
+    """A first row of numbers is data."""
     rows = [first, *(f"{0.01 * k:.2f},2.5,0,0,{k}" for k in range(1, 60))]
     (tmp_path / "x.csv").write_text("\n".join(rows))
     summary = inspect_command(tmp_path / "x.csv", tmp_path, quiet=True)
@@ -296,7 +294,7 @@ def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) ->
     assert len(read_table(tmp_path / "x.csv", header=False).numbers_with_nan(0, "here")) == 60
 
 
-def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:
+def test_unknown_unit_has_a_placeholder(tmp_path: Path) -> None:
     t = np.arange(50) * 0.01
     names = (
         [f"F{a} [kilo]" for a in "xyz"] + [f"T{a} [Nm]" for a in "xyz"] + ["qw", "qx", "qy", "qz"]
@@ -357,7 +355,7 @@ def test_force_and_torque_are_those_of_one_sensor() -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "streams", "lacking"),
+    ("columns", "streams", "missing"),
     [
         (
             ["qw", "qx", "qy", "qz"],
@@ -369,16 +367,16 @@ def test_force_and_torque_are_those_of_one_sensor() -> None:
         (["a", "b"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),
     ],
 )
-def test_a_draft_has_what_there_is_and_says_what_is_missing(
-    tmp_path: Path, columns: list[str], streams: set[str], lacking: list[str]
+def test_draft_has_the_available_streams_and_lists_missing_ones(
+    tmp_path: Path, columns: list[str], streams: set[str], missing: list[str]
 ) -> None:
     t = np.arange(50) * 0.01
     pl.DataFrame({"t": t} | {name: t for name in columns}).write_csv(tmp_path / "table.csv")
     summary = inspect_command(tmp_path / "table.csv", tmp_path, quiet=True)
     text = (tmp_path / "draft.yaml").read_text()
     assert set(yaml.safe_load(text)) == streams
-    assert [found["name"] for found in summary["findings"]] == ["incomplete"] * len(lacking)
-    for words, found in zip(lacking, summary["findings"], strict=True):
+    assert [found["name"] for found in summary["findings"]] == ["incomplete"] * len(missing)
+    for words, found in zip(missing, summary["findings"], strict=True):
         assert words in found["message"]
         assert f"# INCOMPLETE, this has {found['message'].removeprefix('the draft has ')}" in text
 
@@ -391,14 +389,14 @@ def test_unreadable_input_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
-def test_a_good_real_record_has_its_lag_only(ntnu: Path, tmp_path: Path, record: str) -> None:
+def test_good_real_record_has_only_a_lag(ntnu: Path, tmp_path: Path, record: str) -> None:
     path = ntnu_log(ntnu, tmp_path, record, frame=NTNU_FRAME)
     summary = inspect_command(path, tmp_path, quiet=True)
     assert [found["name"] for found in summary["findings"]] == ["lag"]
     assert summary["delay_s"] == pytest.approx(0.006, abs=1e-3)
 
 
-def test_the_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None:
+def test_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None:
     summary = inspect_command(ntnu_log(ntnu, tmp_path, "1-baseline"), tmp_path, quiet=True)
     assert [found["name"] for found in summary["findings"]] == ["swapped axes", "lag"]
     np.testing.assert_allclose(summary["mounting"]["R_SI"], NTNU_FRAME, atol=0.03)
@@ -408,10 +406,10 @@ def test_the_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", [{}, {"pose": False}])
-def test_identify_takes_no_reversed_gravity_for_axes_and_a_torque_factor(
+def test_reversed_gravity_is_not_reported_as_axes_and_a_torque_factor(
     tmp_path: Path, streams: dict[str, bool]
 ) -> None:
-    """Mirrored axes explain the weight, but not that the inertia would be negative."""
+    """Mirrored axes explain the weight, but would make the inertia negative."""
     columns = good()
     planted.reversed_gravity(columns)
     with pytest.raises(DrakeTeleopError, match=r"gravity is reversed; set imu\.sign: -1"):
@@ -419,7 +417,7 @@ def test_identify_takes_no_reversed_gravity_for_axes_and_a_torque_factor(
 
 
 @pytest.mark.parametrize("streams", [{}, {"pose": False}, {"imu": False}])
-def test_a_wrench_that_never_changes_is_named(tmp_path: Path, streams: dict[str, bool]) -> None:
+def test_constant_wrench_is_named(tmp_path: Path, streams: dict[str, bool]) -> None:
     columns = good()
     columns["force"][:], columns["torque"][:] = 1.0, 0.1
     assert set(findings(tmp_path, columns, **streams)) == {"dead channel"}

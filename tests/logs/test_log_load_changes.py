@@ -1,4 +1,4 @@
-"""`identify` says so when the load changes in a record, and only then."""
+"""Load changes that `identify` reports, in simulated and real records."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
 
 
 def simulated(path: Path, grasped_at: float, clock: float = 0.0) -> Path:
-    """A canonical log, 12 s at 500 Hz."""
+    """Write a canonical log, 12 s at 500 Hz."""
     t = np.arange(0.0, 12.0, 2e-3)
     motion = motion_at(t)
     parts = motion.specific_force, motion.omega, motion.alpha
@@ -46,10 +46,10 @@ def simulated(path: Path, grasped_at: float, clock: float = 0.0) -> Path:
 
 
 @pytest.mark.slow
-def test_identify_says_when_the_load_changes(
+def test_identify_reports_the_time_of_a_load_change(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In the log's own time."""
+    """The time is that of the log."""
     summary = identify_command(simulated(tmp_path / "log.parquet", 4.0, clock=100.0), tmp_path)
     (cause,) = summary["causes"]
     assert cause["name"] == "load change"
@@ -62,7 +62,7 @@ def test_identify_says_when_the_load_changes(
 
 
 @pytest.mark.slow
-def test_identify_says_nothing_if_it_does_not(tmp_path: Path) -> None:
+def test_identify_reports_no_change_of_a_constant_load(tmp_path: Path) -> None:
     summary = identify_command(simulated(tmp_path / "log.parquet", 20.0), tmp_path, quiet=True)
     assert summary["causes"] == [] and summary["loads"] == []
 
@@ -72,17 +72,17 @@ def test_identify_says_nothing_if_it_does_not(tmp_path: Path) -> None:
 def test_ntnu_records_have_one_load(
     ntnu: Path, tmp_path: Path, record: str, cutoff_hz: float | None
 ) -> None:
-    """Turning about one axis, free and with a hammer tapping on the robot."""
+    """The sensor rotates about one axis, freely and with a hammer that taps on the robot."""
     assert identify_log(describe_record(tmp_path, ntnu, record), cutoff_hz=cutoff_hz).loads == ()
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
-def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None:
-    """Unfiltered; known from the poses of another day, with 2 % of model errors.
+def test_only_an_added_load_is_found(ntnu: Path, tmp_path: Path, record: str) -> None:
+    """The log is unfiltered; the load is from poses of another day, with 2 % of model errors.
 
     Vibration is four times the noise at rest (README of the records), offsets drift by 0.5 N. The
-    hammer may disturb, and is no load. 0.25 kg that are added to the wrench are one.
+    hammer is a disturbance, not a load. Adding 0.25 kg to the wrench is a change.
     """
     known = identify_log(describe_poses(tmp_path, ntnu, GRAVITY)).identification
     log = identify_log(describe_record(tmp_path, ntnu, record), cutoff_hz=None).log
@@ -106,8 +106,8 @@ def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None
 
 
 @pytest.mark.long
-def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
-    """Eight pushes of up to 50 N on a handle of 0.1 kg."""
+def test_ur5_pushes_are_not_a_load_change(ur5: Path, tmp_path: Path) -> None:
+    """Eight pushes of up to 50 N act on a handle of 0.1 kg."""
     record = f"{ur5}/No9_Singularity_Free_ForceSensor__"
     description: dict[str, Any] = {
         "wrench": {
@@ -133,7 +133,7 @@ def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_utias_records_have_one_load(utias: Path) -> None:
-    """Ten tools from 9 g to 1 kg, stop and go, with the noise that their makers call high."""
+    """Ten tools from 9 g to 1 kg stop and go, with the noise that the authors call high."""
     s_std, alpha_std, f_std, tau_std = 0.1, 1.0, 0.2, 0.01
     for file in sorted(utias.glob("*.npz")):
         with np.load(file) as data:

@@ -1,4 +1,4 @@
-"""Mistakes that leave the fit of a load good are named, with the line that mends them."""
+"""Mistakes that a good fit of the load hides are named, with the line that fixes them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def good() -> Columns:
 
 
 def record(seconds: float) -> Columns:
-    """100 Hz, with noise."""
+    """Return a record at 100 Hz with noise."""
     rng = np.random.default_rng(3)
     t = np.arange(0.0, seconds, 0.01)
     at = motion_at(t)
@@ -52,8 +52,8 @@ def record(seconds: float) -> Columns:
     }
 
 
-def said(folder: Path, columns: Columns, motion: tuple[str, ...], **top: Any) -> list[str]:
-    """Names and messages of the findings but for lags; `top` are fields of the description."""
+def findings_of(folder: Path, columns: Columns, motion: tuple[str, ...], **top: Any) -> list[str]:
+    """Return findings other than lags; `top` are fields of the description."""
     document: dict[str, Any] = {"gravity": GRAVITY_W.tolist()}
     for stream in ("wrench", *motion):
         table = {"t": columns.get(f"{stream}_t", columns["t"])}
@@ -71,10 +71,8 @@ def said(folder: Path, columns: Columns, motion: tuple[str, ...], **top: Any) ->
 
 
 @pytest.mark.parametrize("motion", [IMU, POSE, BOTH])
-def test_nothing_is_said_of_a_good_log(
-    good: Columns, tmp_path: Path, motion: tuple[str, ...]
-) -> None:
-    assert said(tmp_path, good, motion) == []
+def test_good_log_has_no_finding(good: Columns, tmp_path: Path, motion: tuple[str, ...]) -> None:
+    assert findings_of(tmp_path, good, motion) == []
 
 
 def _times(name: str, factor: float) -> Callable[[Columns], None]:
@@ -98,7 +96,7 @@ def _tcp(c: Columns) -> None:
     c["position"] = c["position"] + c["R"] @ [0.02, 0.0, 0.15]
 
 
-def _dead(name: str) -> Callable[[Columns], None]:
+def _held(name: str) -> Callable[[Columns], None]:
     def plant(c: Columns) -> None:
         c[name] = c[name].copy()
         c[name][:, 1] = 0.5
@@ -106,7 +104,7 @@ def _dead(name: str) -> Callable[[Columns], None]:
     return plant
 
 
-def _copied(c: Columns) -> None:
+def _repeated_column(c: Columns) -> None:
     c["force"] = c["force"][:, [0, 0, 2]]
 
 
@@ -155,9 +153,9 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
     ("turned 45", _wrench_in(ABOUT_Z), POSE, "pose frame", "pose.rotation_in_sensor: [[0.7"),
     ("TCP", _tcp, BOTH, "pose frame", "pose.position_in_sensor: [0.0"),
     ("clock", lambda c: c.update(pose_t=1.01 * c["t"]), POSE, "clock", "pose.time.scale: 0.990"),
-    ("dead", _dead("torque"), IMU, "dead channel", "'torque_1'"),
-    ("dead gyro", _dead("angular_velocity"), IMU, "dead channel", "'angular_velocity_1'"),
-    ("copied", _copied, IMU, "repeated channel", "'force_0' and 'force_1'"),
+    ("dead", _held("torque"), IMU, "dead channel", "'torque_1'"),
+    ("dead gyro", _held("angular_velocity"), IMU, "dead channel", "'angular_velocity_1'"),
+    ("copied", _repeated_column, IMU, "repeated channel", "'force_0' and 'force_1'"),
 ]
 
 
@@ -166,7 +164,7 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
 @pytest.mark.parametrize(
     ("plant", "motion", "name", "line"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]
 )
-def test_a_mistake_is_named(
+def test_planted_mistake_is_named(
     good: Columns,
     tmp_path: Path,
     plant: Callable[[Columns], None],
@@ -176,14 +174,14 @@ def test_a_mistake_is_named(
 ) -> None:
     columns = dict(good)
     plant(columns)
-    found = said(tmp_path, columns, motion)
+    found = findings_of(tmp_path, columns, motion)
     assert any(text.startswith(f"{name}: ") and line in text for text in found), found
 
 
-def test_identify_names_what_a_good_fit_hides(tmp_path: Path) -> None:
-    columns = record(16.0)  # the mean of an acceleration is small only then
+def test_identify_names_a_wrong_scale_despite_a_good_fit(tmp_path: Path) -> None:
+    columns = record(16.0)  # only then is the mean of an acceleration small
     columns["specific_force"] = 1.05 * columns["specific_force"]
-    (text,) = said(tmp_path, columns, IMU)
+    (text,) = findings_of(tmp_path, columns, IMU)
     assert text.startswith("gravity: ")
     assert float(text.split("force by ")[1].split(",")[0]) == pytest.approx(1.05, abs=2e-3)
     (found,) = identify_log(tmp_path / "log.yaml").findings
@@ -192,7 +190,7 @@ def test_identify_names_what_a_good_fit_hides(tmp_path: Path) -> None:
 
 def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) -> None:
     names = {"columns": ["torque_0", "torque_0", "torque_2"]}
-    found = said(tmp_path, good, IMU, torque=names)
+    found = findings_of(tmp_path, good, IMU, torque=names)
     assert [text for text in found if "names 'torque_0' twice" in text] == found[:1]
 
 

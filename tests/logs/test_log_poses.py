@@ -76,12 +76,12 @@ def deviations(found: IdentifiedLog) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def whole(folder) -> IdentifiedLog:
+def from_whole(folder) -> IdentifiedLog:
     return identify_log(described(folder, "own"), cutoff_hz=10.0)
 
 
-def test_identify_compensates_for_noise_of_poses(whole):
-    found = whole
+def test_identify_compensates_for_noise_of_poses(from_whole):
+    found = from_whole
     load = found.identification
     assert np.abs(deviations(found)).max() < 3.5
     assert load.identifiable.all() and not found.findings
@@ -93,7 +93,7 @@ def test_identify_compensates_for_noise_of_poses(whole):
 
 
 @pytest.mark.parametrize("bursts", [True, False])
-def test_load_is_identified_despite_inexact_stamps(whole, folder, tmp_path, bursts):
+def test_load_is_identified_despite_inexact_stamps(from_whole, folder, tmp_path, bursts):
     """Five rows per stamp of 1 ms resolution, or 1.6 ms jitter and a clock 0.04 % faster."""
     table = pl.read_csv(folder / "own_pose.csv")
     t = table["t"].to_numpy()
@@ -102,7 +102,7 @@ def test_load_is_identified_despite_inexact_stamps(whole, folder, tmp_path, burs
     table[: len(stamps)].with_columns(t=pl.Series(stamps)).write_csv(tmp_path / "own_pose.csv")
     (tmp_path / "own_wrench.csv").write_bytes((folder / "own_wrench.csv").read_bytes())
     found = identify_log(described(tmp_path, "own"), cutoff_hz=10.0)
-    load, exact = found.identification, whole.identification
+    load, exact = found.identification, from_whole.identification
     assert np.abs(deviations(found)).max() < 3.5
     assert load.identifiable.all() and not found.findings
     wider = load.standard_deviations[6:] / exact.standard_deviations[6:]
@@ -137,10 +137,10 @@ LIMITS = {
     "aligned_log._CHUNK_SAMPLES": 70,
     "aligned_log._FILTER_NEIGHBOURS": 30,
 }
-"""What an hour at 1 kHz is too long for, so low that 10 s are."""
+"""Limits so low that a record of 10 s is read in parts, as an hour at 1 kHz."""
 
 
-def test_long_log_read_in_parts_gives_the_same_load(whole, folder, tmp_path, monkeypatch):
+def test_long_log_read_in_parts_gives_the_same_load(from_whole, folder, tmp_path, monkeypatch):
     files = {}
     for stream in ("wrench", "pose"):
         files[stream] = f"own_{stream}.parquet"
@@ -150,20 +150,20 @@ def test_long_log_read_in_parts_gives_the_same_load(whole, folder, tmp_path, mon
     path = described(tmp_path, "own", wrench={"file": files["wrench"]}, file=files["pose"])
     parts = identify_log(path, cutoff_hz=10.0)
     assert not isinstance(read_table(tmp_path / files["pose"]).columns, dict)
-    moved = parts.identification.phi - whole.identification.phi
-    assert (np.abs(moved) < 0.02 * whole.identification.standard_deviations[6:]).all()
-    few, all_ = parts.log, whole.log
+    moved = parts.identification.phi - from_whole.identification.phi
+    assert (np.abs(moved) < 0.02 * from_whole.identification.standard_deviations[6:]).all()
+    few, all_ = parts.log, from_whole.log
     assert len(few) == pytest.approx(len(all_) / 5, abs=8)
     np.testing.assert_allclose(few.dt, 5 * all_.dt)
     same = np.searchsorted(all_.t, few.t - 1e-6)[5:-5]
     np.testing.assert_allclose(all_.t[same], few.t[5:-5], atol=1e-9)
     off = few.wrench[5:-5] - all_.wrench[same]
-    assert (np.abs(off).max(axis=0) < 0.5 * whole.identification.residual_rms).all()
+    assert (np.abs(off).max(axis=0) < 0.5 * from_whole.identification.residual_rms).all()
     for one, other in zip(few.motion, all_.motion, strict=True):
         scale = np.abs(other).max(axis=0)
         np.testing.assert_allclose(one[5:-5] / scale, other[same] / scale, atol=5e-3)
     np.testing.assert_allclose(
-        parts.identification.residual_rms, whole.identification.residual_rms, rtol=0.1
+        parts.identification.residual_rms, from_whole.identification.residual_rms, rtol=0.1
     )
 
 

@@ -1,4 +1,4 @@
-"""The README's commands for logs, word for word, on the sample log; they find what is in it."""
+"""Commands of the README for logs, run on the sample log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def contents(path: str) -> Any:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where the README's commands have been run."""
+    """Return the folder in which the README's commands have been run."""
     folder = tmp_path_factory.mktemp("readme")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -36,23 +36,23 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def here(folder, monkeypatch):
+def in_folder(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
 @pytest.mark.slow
-def test_the_description_is_the_one_that_the_docs_show():
+def test_description_equals_that_of_the_docs():
     shown = yaml_block("docs/logs.md", "# A gripper")
     assert Path("out/sample/free.yaml").read_text() == shown
 
 
 @pytest.mark.slow
-def test_nothing_is_wrong_with_the_sample_but_that_its_pose_is_late():
+def test_only_finding_of_the_sample_is_the_lag_of_its_pose():
     assert [found["name"] for found in contents("out/inspect/summary.json")["findings"]] == ["lag"]
 
 
 @pytest.mark.slow
-def test_the_load_is_identified():
+def test_readme_commands_identify_the_load():
     truth, load = contents("out/sample/truth.json"), contents("out/load/identification.json")
     assert all(load["identifiable"])
     for name, value in {"mass": 5e-4, "com": 1e-4, "delay_s": 3e-4}.items():
@@ -63,7 +63,7 @@ def test_the_load_is_identified():
 
 
 @pytest.mark.slow
-def test_what_is_left_is_the_touches():
+def test_result_contains_only_the_touches():
     truth = contents("out/sample/truth.json")["contacts"]
     free = contents("out/load/summary.json")["residual_rms_force"]
     assert free < 0.1  # N, of the sensor's noise after the low-pass
@@ -73,20 +73,20 @@ def test_what_is_left_is_the_touches():
     for contact, touch in zip(found, truth, strict=True):
         assert contact["peak_N"] == pytest.approx(touch["peak_N"], rel=0.03)
         assert contact["push"] == pytest.approx(touch["push"], abs=0.03)
-        # The low-pass of 30 Hz shows a touch up to half a period early.
+        # The low-pass of 30 Hz widens a touch by up to half a period.
         assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.5 / 30.0 + 0.004)
         assert contact["stop_s"] == pytest.approx(touch["stop_s"], abs=0.06)
 
 
 @pytest.mark.slow
-def test_it_is_printed_as_a_robot_of_ur_takes_it(capsys):
+def test_export_prints_the_call_for_a_ur_robot(capsys):
     type_in("docs/robot.md", "drake-teleop export")
     mass, com, inertia = re.findall(
         r"set_target_payload\((.*?), \[(.*?)\], \[(.*?)\]\)", capsys.readouterr().out
     )[0]
     load = contents("out/load/identification.json")
     assert float(mass) == pytest.approx(load["mass"], rel=1e-5)
-    x, y, z = load["com"]  # turned by 45 degrees and moved along the axis
+    x, y, z = load["com"]  # rotated by 45 degrees and shifted along the axis
     moved = [(x - y) / 2**0.5, (x + y) / 2**0.5, z + 0.045]
     assert [float(word) for word in com.split(",")] == pytest.approx(moved, abs=1e-6)
     assert len(inertia.split(",")) == 6
@@ -94,14 +94,14 @@ def test_it_is_printed_as_a_robot_of_ur_takes_it(capsys):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
-    def written(folder: Path) -> dict[str, bytes]:
+    def bytes_of(folder: Path) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in folder.iterdir()}
 
-    shipped = written(Path("out/sample"))
+    shipped = bytes_of(Path("out/sample"))
     assert sum(map(len, shipped.values())) < 1e6
     sample_log_command(tmp_path, quiet=True)
-    assert written(tmp_path) == shipped
+    assert bytes_of(tmp_path) == shipped
     sample_log_command(tmp_path, seed=1, quiet=True)
-    other = written(tmp_path)
+    other = bytes_of(tmp_path)
     same = {name for name in shipped if other[name] == shipped[name]}
     assert same == {"free.yaml", "touched.yaml", "truth.json"}

@@ -1,4 +1,4 @@
-"""The report of identify: what is known is printed, what is not known is not."""
+"""Report of identify: identified values are printed, undetermined ones are not."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def record(path: Path) -> Path:
 @pytest.mark.long
 @pytest.mark.pictures
 @pytest.mark.slow
-def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path) -> None:
+def test_page_is_self_contained_and_has_the_numbers_of_the_summary(tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = identify_command(record(tmp_path / "<log>.parquet"), out, delay=0.0, quiet=True)
     page = (out / "report.html").read_text(encoding="utf-8")
     assert (out / "report.png").stat().st_size > 50_000
-    # Nothing is fetched: no address but the data in it, and what came from the log is escaped.
+    # The page loads no address, and text from the log is escaped.
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert "://" not in page and "<log>" not in page and "&lt;log&gt;.parquet" in page
     assert page.count("data:image/png;base64,") == 2
@@ -72,7 +72,7 @@ def test_the_centre_of_mass_is_not_identifiable_without_the_mass(
         assert len(lines) == count and all("mass" in x or "com" in x for x in lines)
 
 
-def test_what_is_not_identified_has_no_value_in_the_table() -> None:
+def test_undetermined_parameter_has_no_value_in_the_table() -> None:
     rng = np.random.default_rng(1)
     s = rng.normal(size=(24, 3)) * 9
     rest = np.zeros((24, 3))
@@ -88,7 +88,7 @@ def test_what_is_not_identified_has_no_value_in_the_table() -> None:
     assert len(mass.deviation.replace("0.", "").lstrip("0")) == 2
 
 
-def test_static_poses_have_a_page_too(tmp_path: Path) -> None:
+def test_static_poses_have_a_page(tmp_path: Path) -> None:
     poses = tmp_path / "poses.csv"
     rng = np.random.default_rng(2)
     gravity = rng.normal(size=(15, 3))
@@ -138,7 +138,7 @@ def test_the_spectrum_has_the_power_of_the_signal() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_robust_fit_says_what_it_left_out(
+def test_report_states_the_samples_rejected_by_a_robust_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = record(tmp_path / "log.parquet")
@@ -155,7 +155,7 @@ def test_a_robust_fit_says_what_it_left_out(
                                    delay=0.0)  # fmt: skip
         errors[method] = np.linalg.norm(np.array(summary["phi"])[:4] - PHI[:4])
     assert summary["method"] == "robust least squares"
-    # The low-pass at 30 Hz lengthens the 40 samples by some 20.
+    # The low-pass at 30 Hz lengthens the 40 samples by about 20.
     assert 40 / 1500 < summary["rejected"] < 90 / 1500
     assert "rejected as disturbed" in capsys.readouterr().out
     assert errors["robust"] < 0.1 * errors["ordinary"]

@@ -45,7 +45,7 @@ def test_solve_handles_a_zero_residual() -> None:
 
 @pytest.mark.parametrize("inverse", [False, True])
 @pytest.mark.parametrize("form", NUM_COLUMNS_OF_ROTATION_FORM)
-def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: bool) -> None:
+def test_orientations_of_selected_rows_in_any_form_are_read(form: str, inverse: bool) -> None:
     turns = Rotation.from_rotvec(VECTORS[:5])
     columns = {
         "matrix": turns.as_matrix().reshape(-1, 9),

@@ -1,4 +1,4 @@
-"""`eliminate` and `detect` with the motion of splines: what they leave, contacts, and edges."""
+"""`eliminate` and `detect` with spline motion: residuals, contacts and edges."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ LOAD = Identification(
 
 
 def contact_at(t: np.ndarray, touches: tuple = TOUCHES) -> np.ndarray:
-    """(N, 6) half sines along `PUSH`."""
+    """Return (N, 6) half sines along `PUSH`."""
     out = np.zeros((len(t), 6))
     for start, stop, size in touches:
         share = np.clip((t - start) / (stop - start), 0.0, 1.0)
@@ -59,7 +59,7 @@ def contact_at(t: np.ndarray, touches: tuple = TOUCHES) -> np.ndarray:
 
 
 def described(folder: Path, tables: dict[str, tuple[np.ndarray, tuple, np.ndarray]]) -> Path:
-    """A description of streams: times, names and values of each."""
+    """Write tables of times, names and values of each stream, and their description."""
     document: dict = {"gravity": GRAVITY_W.tolist()}
     for name, (t, names, values) in tables.items():
         columns = {"t": t} | dict(zip(names, values.T, strict=True))
@@ -83,10 +83,10 @@ def described(folder: Path, tables: dict[str, tuple[np.ndarray, tuple, np.ndarra
     return path
 
 
-def logged(
+def log_of(
     folder: Path, kind: Kind, *, held: float = 0.0, touches: tuple = (), seconds: float = SECONDS
 ) -> Path:
-    """The log of a record; with `held` [Hz] a table of the newest samples at that rate."""
+    """Write a record as a log; with `held` [Hz] as a table of the newest samples at that rate."""
     t, wrench, poses = record(replace(kind, wrench_rate=500.0) if held else kind)
     wrench = wrench + contact_at(t, touches)
     rows = np.hstack([poses.quaternion, poses.position])
@@ -105,8 +105,8 @@ def logged(
     )
 
 
-def noise_left(found: EliminatedLog, touches: tuple = ()) -> np.ndarray:
-    """(2,) rms of what is left of force and torque, over that of the sensor's noise."""
+def noise_ratio(found: EliminatedLog, touches: tuple = ()) -> np.ndarray:
+    """Return (2,) rms residual of force and torque over that of the sensor's noise."""
     dt, begin = found.log.dt, 0.05 if found.log.dt > 0.015 else 0.0
     passed = low_pass(np.random.default_rng(0).normal(size=(4000, 1)), dt, 30.0).std()
     truth = low_pass(contact_at(found.log.t + begin, touches), dt, 30.0)
@@ -116,7 +116,7 @@ def noise_left(found: EliminatedLog, touches: tuple = ()) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample log, and the load that is identified from its free motion."""
+    """Return the sample log, and the load that is identified from its free motion."""
     folder = tmp_path_factory.mktemp("sample")
     sample_log_command(folder, quiet=True)
     identify_log(folder / "free.yaml").identification.save(folder / "load.json")
@@ -126,7 +126,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def held_sample(
     sample: Path, folder: Path, name: str, rate: float, begin: float = 0.05, stop: float = 8.95
 ) -> Path:
-    """One canonical table of a sample log at `rate` [Hz], of the newest samples at each time."""
+    """Write a sample log as a canonical table at `rate` [Hz] of the newest samples at each time."""
     wrench, pose = (pl.read_csv(sample / f"{name}_{x}.csv").to_numpy() for x in ("wrench", "pose"))
     frames = np.arange(begin, stop, 1.0 / rate)
     w, p = (
@@ -145,7 +145,7 @@ def held_sample(
 
 @pytest.mark.long
 @pytest.mark.parametrize("rate", [25.0, 30.0, 50.0, 60.0])
-def test_what_is_left_at_the_rate_of_a_camera_is_the_noise_of_the_record(sample, tmp_path, rate):
+def test_residual_at_the_rate_of_a_camera_is_the_noise_of_the_record(sample, tmp_path, rate):
     path = held_sample(sample, tmp_path, "free", rate)
     found = eliminate_log(path, sample / "load.json")
     left = np.sqrt(np.mean(found.contact[~found.edge].reshape(-1, 2, 3) ** 2, axis=(0, 2)))
@@ -175,10 +175,10 @@ def test_contacts_at_the_rate_of_a_camera_are_those_at_the_full_rate(sample, tmp
 @pytest.mark.long
 @pytest.mark.parametrize(("rate", "seed"), [(30.0, 4), (125.0, 5), (1000.0, 6)])
 @pytest.mark.parametrize("touches", [(), TOUCHES])
-def test_what_is_left_is_the_noise_of_the_sensor(tmp_path, rate, seed, touches):
+def test_residual_is_the_noise_of_the_sensor(tmp_path, rate, seed, touches):
     kind = Kind(rate=rate, place=5e-5, turn=1e-4, seed=seed)
-    found = eliminate_log(logged(tmp_path, kind, touches=touches), LOAD)
-    assert (noise_left(found, touches) < 1.2).all()
+    found = eliminate_log(log_of(tmp_path, kind, touches=touches), LOAD)
+    assert (noise_ratio(found, touches) < 1.2).all()
     assert found.delay_s == pytest.approx(LATE, abs=3e-4)
     np.testing.assert_allclose(found.offsets, OFFSETS, atol=0.05)
     in_touch = np.abs(contact_at(found.log.t, touches)).max(axis=1) > 1.0
@@ -188,23 +188,23 @@ def test_what_is_left_is_the_noise_of_the_sensor(tmp_path, rate, seed, touches):
 
 @pytest.mark.parametrize(("place", "turn", "colour"), [(3e-4, 6e-4, 0.0), (1e-4, 2e-4, 0.9)])
 def test_noise_of_the_poses_is_no_contact(tmp_path, place, turn, colour):
-    """Differentiated to 30 Hz, such poses leave 10 to 50 times the sensor's noise."""
+    """Differentiated at 30 Hz, such poses leave 10 to 50 times the sensor's noise."""
     kind = Kind(rate=250.0, place=place, turn=turn, colour=colour, seed=6)
-    found = eliminate_log(logged(tmp_path, kind, touches=TOUCHES), LOAD)
-    assert (noise_left(found, TOUCHES) < 1.35).all()
+    found = eliminate_log(log_of(tmp_path, kind, touches=TOUCHES), LOAD)
+    assert (noise_ratio(found, TOUCHES) < 1.35).all()
     assert found.delay_s == pytest.approx(LATE, abs=3e-4)
 
 
 @pytest.mark.parametrize(("held", "seconds"), [(30.0, 3.0), (30.0, 5.0), (50.0, 4.0), (0.0, 2.0)])
-def test_records_that_are_too_short_to_identify_a_load_have_splines_too(tmp_path, held, seconds):
+def test_short_records_have_splines(tmp_path, held, seconds):
     kind = Kind(rate=500.0, place=5e-5, turn=1e-4, seed=7)
-    found = eliminate_log(logged(tmp_path, kind, held=held, seconds=seconds), LOAD)
-    assert (noise_left(found) < 1.25).all()
+    found = eliminate_log(log_of(tmp_path, kind, held=held, seconds=seconds), LOAD)
+    assert (noise_ratio(found) < 1.25).all()
     assert found.delay_s == pytest.approx(LATE, abs=2e-3)
 
 
-def test_the_ends_are_marked_and_in_no_figure(sample, tmp_path):
-    path = held_sample(sample, tmp_path, "free", 30.0, begin=1.0, stop=8.0)  # it moves at both
+def test_ends_are_marked_and_excluded_from_figures(sample, tmp_path):
+    path = held_sample(sample, tmp_path, "free", 30.0, begin=1.0, stop=8.0)  # in motion
     summary = eliminate_command(path, sample / "load.json", tmp_path / "out", quiet=True)
     table = pl.read_parquet(tmp_path / "out" / "contact_wrench.parquet")
     edge = table["edge"].to_numpy()
@@ -221,16 +221,16 @@ def test_the_ends_are_marked_and_in_no_figure(sample, tmp_path):
     assert summary["contacts"] == []
 
 
-def saved(folder: Path) -> Path:
+def save(folder: Path) -> Path:
     LOAD.save(folder / "load.json")
     return folder / "load.json"
 
 
-def test_detect_marks_them_as_well(tmp_path):
+def test_detect_marks_the_ends(tmp_path):
     summary = detect_command(
-        logged(tmp_path, Kind(seed=9), held=30.0, touches=TOUCHES),
+        log_of(tmp_path, Kind(seed=9), held=30.0, touches=TOUCHES),
         tmp_path / "out",
-        load=saved(tmp_path),
+        load=save(tmp_path),
         quiet=True,
     )
     table = pl.read_parquet(tmp_path / "out" / "detection.parquet")
@@ -247,13 +247,13 @@ def test_a_gap_of_the_poses_has_edges(tmp_path):
     found = eliminate_log(described(tmp_path, tables), LOAD)
     beside = np.abs(found.log.t - 8.25) < 0.4
     assert found.edge[beside].all() and not found.edge[np.abs(found.log.t - 5.0) < 1.0].any()
-    assert (noise_left(found) < 1.2).all() and not found.touched.any()
+    assert (noise_ratio(found) < 1.2).all() and not found.touched.any()
 
 
 @pytest.mark.long
 def test_a_differentiated_motion_has_edges_of_half_a_window(tmp_path):
-    """Without positions there are no splines: half of 1.8 / 30 Hz, or four samples, at 125 Hz."""
-    path = logged(tmp_path, Kind(place=0.0, turn=0.0, seed=1))
+    """Splines need positions: half of 1.8 / 30 Hz, or four samples, at 125 Hz."""
+    path = log_of(tmp_path, Kind(place=0.0, turn=0.0, seed=1))
     document = yaml.safe_load(path.read_text())
     del document["pose"]["position"]
     path.write_text(yaml.safe_dump(document))
@@ -263,8 +263,8 @@ def test_a_differentiated_motion_has_edges_of_half_a_window(tmp_path):
         assert found.edge[0] and found.edge[-1]
 
 
-def test_the_causal_wrench_keeps_the_motion_that_a_loop_has(tmp_path):
-    path = logged(tmp_path, Kind(place=0.0, turn=0.0, seed=11), touches=TOUCHES)
+def test_causal_wrench_uses_differentiated_motion(tmp_path):
+    path = log_of(tmp_path, Kind(place=0.0, turn=0.0, seed=11), touches=TOUCHES)
     found = eliminate_log(path, LOAD, causal="delayed", delay=LATE)
     log = remove_delay(read_log(path), LATE)
     contact = contact_wrench(log.wrench, OFFSETS, *log.motion, PHI)
@@ -286,13 +286,13 @@ def test_a_record_at_rest_takes_the_delay_of_the_load(tmp_path):
         described(tmp_path, {"wrench": (t, WRENCH, wrench), "pose": (poses.t, POSE, still)}), LOAD
     )
     assert (found.delay_s, found.delay_source) == (LOAD.delay_s, "load")
-    assert (noise_left(found, TOUCHES) < 1.1).all()
+    assert (noise_ratio(found, TOUCHES) < 1.1).all()
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.15)])
 def test_an_imu_is_used_where_the_load_explains_more_with_it(tmp_path, shift):
-    """With poses of S the splines win: the IMU's noise would leave three times the sensor's."""
+    """Splines win with poses of S: the IMU's noise would leave three times the sensor's."""
     t, wrench, poses = record(Kind(place=1e-4, turn=2e-4, seed=13))
     at = motion_at(t)
     rng = np.random.default_rng(3)
@@ -309,12 +309,12 @@ def test_an_imu_is_used_where_the_load_explains_more_with_it(tmp_path, shift):
         "imu": (t, ("sx", "sy", "sz", "wx", "wy", "wz"), np.hstack([s, omega])),
     }
     found = eliminate_log(described(tmp_path, tables), LOAD)
-    assert (noise_left(found) < 1.2).all()
+    assert (noise_ratio(found) < 1.2).all()
     assert found.delay_s == pytest.approx(0.0 if any(shift) else LATE, abs=1e-3)
 
 
 @pytest.mark.parametrize("rate", [0.9996, 1.0, 1.0005])
-def test_the_clock_of_the_poses_is_corrected_with_a_known_load_too(rate):
+def test_clock_of_the_poses_is_corrected_with_a_known_load(rate):
     t, wrench, poses = record(Kind(place=5e-5, turn=1e-4, seed=14))
     late = Poses(rate * poses.t, poses.position, poses.quaternion)
     found = fit_motion_to_load(t, wrench, late, GRAVITY_W, load_coefficients(PHI))

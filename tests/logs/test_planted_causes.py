@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @cache
-def judged(kind: str, motion: str, sensor: str, seed: int) -> dict[str, Any]:
+def run_case(kind: str, motion: str, sensor: str, seed: int) -> dict[str, Any]:
     return run((kind, motion, sensor, seed))
 
 
@@ -45,7 +45,7 @@ def judged(kind: str, motion: str, sensor: str, seed: int) -> dict[str, Any]:
 def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
     case: tuple[str, str, str, int], names: set[str]
 ) -> None:
-    found = judged(*case)
+    found = run_case(*case)
     assert {name for name, *_ in found["named"]} == names
     assert found["false"] == []
     assert found["time_error"] is None or found["time_error"] < 0.1
@@ -62,14 +62,14 @@ def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
         ("none", "slow", "imu", 91),
     ],
 )
-def test_no_number_is_certain_and_wrong_where_the_cause_has_no_name(
+def test_no_number_is_significantly_wrong_without_a_named_cause(
     case: tuple[str, str, str, int],
 ) -> None:
-    assert judged(*case)["false"] == []
+    assert run_case(*case)["false"] == []
 
 
 def test_a_slow_record_of_an_imu_gives_mass_and_centre(tmp_path: Path) -> None:
-    """Its angular acceleration is mostly noise, which is no misfit."""
+    """Noise of the angular acceleration is not a misfit."""
     record = make_record("none", "slow", "imu", 31)
     found = identify_log(write(record, tmp_path)).identification
     assert found.identifiable.tolist() == [True] * 10 + [False] * 6
@@ -78,7 +78,7 @@ def test_a_slow_record_of_an_imu_gives_mass_and_centre(tmp_path: Path) -> None:
 
 
 def test_a_factor_that_slow_motion_does_not_determine_leaves_the_load_uncertain() -> None:
-    found = judged("torque factor", "pick", "poses", 25)
+    found = run_case("torque factor", "pick", "poses", 25)
     assert [name for name, *_ in found["named"]] == ["torque factor"]
     assert "or 0.112985" in found["messages"][0]  # the true one: pound-force inches
     assert found["false"] == []
@@ -97,7 +97,7 @@ def test_contact_and_the_opposite_sign_are_named_together(
 
 
 def test_a_misfit_without_a_known_cause_is_a_finding(tmp_path: Path) -> None:
-    """Contact that is not recognised: no load is known, and the user learns why."""
+    """No load is identified under undetected contact, and a finding states the reason."""
     found = identify_log(write(make_record("contact", "fourier", "poses", 22), tmp_path))
     assert not found.causes and not found.identification.identifiable[6:].any()
     (finding,) = found.findings

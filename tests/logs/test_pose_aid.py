@@ -68,7 +68,7 @@ def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
 
 @pytest.mark.parametrize("size", [1.0, 0.3, 1e-3])
 def test_gains_of_an_imu_have_a_prior_of_10_percent(size):
-    """Ridge regression: an axis that hardly turns has no gain error."""
+    """Ridge regression: an axis that hardly rotates has no gain error."""
     rng, K = np.random.default_rng(7), 40
     y, X, one, change = rng.normal(size=(4, K, 3)) + 1j * rng.normal(size=(4, K, 3))
     X[:, 1] *= size

@@ -370,7 +370,7 @@ def test_fixed_taper_keeps_its_place_when_the_delay_changes():
 
 
 def test_weights_recover_from_a_poor_start():
-    """With 1 mm and 1 mrad the upper bands contain only noise."""
+    """The upper bands contain only noise at 1 mm and 1 mrad."""
     t, wrench, poses = record(Kind(place=1e-3, turn=1e-3, seed=1))
     grid, splines = (
         WrenchGrid.from_samples(t, wrench),

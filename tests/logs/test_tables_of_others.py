@@ -32,7 +32,7 @@ POSITION, QUATERNION = ["p0", "p1", "p2"], ["q0", "q1", "q2", "q3"]
 
 
 def table(sign: float = 1.0, start: float = 0.0) -> pl.DataFrame:
-    """A wrench and its pose in one table, 4 s at 500 Hz."""
+    """Return a wrench and its pose in one table, 4 s at 500 Hz."""
     c = good(start=start)
     groups = {"f": sign * c["force"], "m": sign * c["torque"]}
     groups |= {"p": c["p"], "q": quaternions(c["R"])}
@@ -161,7 +161,7 @@ def test_seconds_and_nanoseconds_are_one_clock(tmp_path: Path) -> None:
 def test_rows_of_a_stream_are_those_in_which_its_columns_are_filled(
     tmp_path: Path, decimated: int
 ) -> None:
-    """As PlotJuggler, Foxglove and pandas.concat write several topics."""
+    """PlotJuggler, Foxglove and pandas.concat write several topics like this."""
     wrench = table().select("t", *FORCE, *TORQUE)
     pose = table().select("t", *POSITION, *QUATERNION).gather_every(decimated)
     pose = pose.with_columns(pl.col("t") + 3e-4)
@@ -183,7 +183,7 @@ def test_a_partly_filled_row_is_still_an_error(tmp_path: Path) -> None:
 
 
 def test_row_numbers_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
-    """Also for a stream with rows of its own."""
+    """One stream has rows of its own."""
     wrench = table().select("t", *FORCE, *TORQUE)
     pose = table().select("t", *POSITION, *QUATERNION)
     pose = pose.with_columns(q0=pl.when(pl.col("t") == 1.0).then(7.0).otherwise(pl.col("q0")))
@@ -315,7 +315,7 @@ def test_hdf5_data_in_other_files_are_not_read(tmp_path: Path) -> None:
 
 
 def drafted(*tables: Path) -> tuple[dict[str, Any], list[str]]:
-    """The draft of tables, and the names of the findings that remain."""
+    """Return the draft for tables, and the names of the remaining findings."""
     out = tables[0].parent / "out"
     summary = inspect_command(tables[0], out, others=tables[1:], quiet=True)
     draft = yaml.safe_load((out / "draft.yaml").read_text())
@@ -333,7 +333,7 @@ def renamed(frame: pl.DataFrame, names: dict[str, str]) -> pl.DataFrame:
 def test_time_is_the_column_that_increases_evenly(
     tmp_path: Path, times: np.ndarray | None, unit: str | None
 ) -> None:
-    """A counter of rows and a value that increases unevenly are no times."""
+    """Counters of rows and unevenly increasing values are not times."""
     uneven = np.cumsum(np.tile([0.1, 2.0], 30))
     columns = {"frame_index": np.arange(60), "F_sum": uneven}
     columns |= {} if times is None else {"Zeit": times}
@@ -356,7 +356,7 @@ def test_units_at_the_end_of_names_are_drafted(tmp_path: Path) -> None:
     assert draft["pose"]["orientation"]["unit"] == "deg"
 
 
-def test_a_force_without_a_torque_is_said_not_to_suffice(tmp_path: Path) -> None:
+def test_force_without_torque_is_reported_as_incomplete(tmp_path: Path) -> None:
     columns = {"t": np.arange(60) * 0.01, **dict.fromkeys(["Fx", "Fy", "Fz"], np.ones(60))}
     pl.DataFrame(columns).write_csv(path := tmp_path / "x.csv")
     draft = draft_description(read_table(path), tmp_path)
@@ -450,7 +450,7 @@ def test_numbered_quaternions_are_drafted(
 def test_order_of_quaternions_and_sign_are_found_together(
     tmp_path: Path, sign: int, push: float
 ) -> None:
-    """Also where contact leaves more than the share of the variance of a valid description."""
+    """Contact leaves more than the residual that a valid description may have."""
     frame = table(sign=float(sign))
     touched = np.abs(frame["t"].to_numpy() - 2.0) < 0.35
     frame = frame.with_columns(pl.col(FORCE[1]) + pl.Series(push * touched))
@@ -514,7 +514,7 @@ def test_a_robot_learning_table_is_drafted(tmp_path: Path) -> None:
     assert found.mass == pytest.approx(PHI[0], abs=5e-3)
 
 
-def test_raw_counts_leave_the_scale_open(tmp_path: Path) -> None:
+def test_scale_of_raw_counts_is_a_placeholder(tmp_path: Path) -> None:
     names = dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
     frame = renamed(
         table(), {"t": "t", **names, **dict(zip(QUATERNION, ["qw", "qx", "qy", "qz"], strict=True))}
@@ -538,7 +538,7 @@ def test_a_short_table_without_time_has_poses_at_rest(tmp_path: Path) -> None:
     assert draft["static"]["orientation"]["columns"] == ["qw", "qx", "qy", "qz"]
 
 
-def test_offsets_come_from_the_untouched_time_or_the_load_file(tmp_path: Path) -> None:
+def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
     path = described(tmp_path, table())
     load = identify_log(path).identification
     t = pl.col("t")

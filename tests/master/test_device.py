@@ -288,7 +288,7 @@ def test_hand_wrench_equals_its_joint_torque():
         np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
 
 
-# q2 = -124 and q3 = 214 degrees are beyond what the five-bar lets the other link reach.
+# q2 = -124 and q3 = 214 degrees are beyond the range of the other link in the five-bar.
 STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)]
 
 
@@ -390,14 +390,14 @@ def test_long_period_or_start_beyond_limit_is_rejected():
 def test_friction_too_large_for_the_step_is_rejected(name, slope):
     """The last wrist joint has 1.5e-4 kg m^2: a step of 0.5 ms allows 0.6 N m s."""
 
-    def made(last):
+    def make_device(last):
         friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
         model = Master(friction=friction).device(0.1, 1e-4)
         device.MasterDevice(5e-4, model, phantom.HOME_POSTURE_RAD)
 
-    made(0.5)
+    make_device(0.5)
     with pytest.raises(DrakeTeleopError, match=r"master\.friction"):
-        made(0.7)
+        make_device(0.7)
 
 
 def test_serial_joint_angles_are_relative_to_the_inner_link():

@@ -38,7 +38,7 @@ def leader(hand=HAND, **changes):
     return dataclasses.replace(LEADER, **changes).device(PLACE, *hand)
 
 
-class Held:
+class ConnectedLeader:
     """Connected device and display; one call is one period."""
 
     def __init__(self, device):
@@ -53,12 +53,12 @@ class Held:
     def step(self, hand, command):
         self.diagram.GetInputPort("hand").FixValue(self.context, hand)
         self.diagram.GetInputPort("command").FixValue(self.context, command)
-        shown = self.shown()
+        shown = self.displayed()
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.steps += 1
         return shown
 
-    def shown(self):
+    def displayed(self):
         context = self.display.GetMyContextFromRoot(self.context)
         return np.array(self.display.GetOutputPort("force_to_master").Eval(context))
 
@@ -70,7 +70,7 @@ class Held:
 def test_motion_equals_drakes_plant_of_the_file():
     """Equal torques and hand force; the hand has no mass here."""
     device = leader(hand=(0.0, 0.0), damping=[0.01])
-    held = Held(device)
+    held = ConnectedLeader(device)
     plant = MultibodyPlant(0.0)
     LEADER.add_to_plant(plant)
     plant.Finalize()
@@ -98,7 +98,7 @@ def test_motion_equals_drakes_plant_of_the_file():
         push.p_BoBq_B = frame.GetFixedPoseInBodyFrame().translation()
         push.F_Bq_W = SpatialForce(hand[3:], hand[:3])
         plant.get_applied_spatial_force_input_port().FixValue(context, [push])
-        # The leader's own damping, which it adds to the model's.
+        # The leader adds its own damping to that of the model.
         for joint in map(plant.get_joint, plant.GetJointIndices()):
             if joint.num_velocities():
                 joint.SetDampingVector(context, joint.default_damping_vector() + 0.01)
@@ -117,13 +117,13 @@ def test_motion_equals_drakes_plant_of_the_file():
     np.testing.assert_allclose(pose[:4], turned * np.sign(turned[0]), atol=1e-9)
 
 
-def test_hand_holds_only_the_displayed_wrench():
+def test_hand_holds_only_the_shown():
     """The hand carries neither the arm's weight nor its own, for any base orientation."""
-    held = Held(leader(friction=[0.0]))
+    held = ConnectedLeader(leader(friction=[0.0]))
     for _ in range(40):
         np.testing.assert_allclose(held.step(-F, F), F, rtol=1e-12)
     np.testing.assert_allclose(held.get("state")[:6], HOME, atol=1e-12)
-    heavy = Held(leader(weight_carried=0.0))
+    heavy = ConnectedLeader(leader(weight_carried=0.0))
     for _ in range(40):
         heavy.step(np.zeros(6), np.zeros(6))
     assert heavy.get("twist_master")[2] < -0.01
@@ -132,7 +132,7 @@ def test_hand_holds_only_the_displayed_wrench():
 def test_work_of_hand_and_motors_equals_energy_plus_friction():
     """Kinetic energy only, because the motors carry the weight."""
     device = leader(friction=[0.01], damping=[0.02])
-    held, work, lost = Held(device), 0.0, 0.0
+    held, work, lost = ConnectedLeader(device), 0.0, 0.0
     before = np.zeros(12)
     for k in range(200):
         hand, command = 1.5 * F * np.sin(0.05 * k), -0.4 * F
@@ -151,7 +151,7 @@ def test_work_of_hand_and_motors_equals_energy_plus_friction():
 
 def test_wrench_is_limited_by_the_motors_and_logged():
     device = leader(torque_limit=[0.9])
-    held = Held(device)
+    held = ConnectedLeader(device)
     shown = held.step(np.zeros(6), 5 * F)
     assert 0.05 < shown[0] / F[0] < 4.9
     np.testing.assert_allclose(shown / F, shown[0] / F[0], rtol=1e-9)  # it keeps its direction
@@ -165,7 +165,7 @@ def test_wrench_is_limited_by_the_motors_and_logged():
 
 
 def test_joints_have_end_stops():
-    held = Held(leader(hand=(0.2, 1e-3)))
+    held = ConnectedLeader(leader(hand=(0.2, 1e-3)))
     for _ in range(800):
         held.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.3]), np.zeros(6))
     q, device = held.get("state")[:6], leader()

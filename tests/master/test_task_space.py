@@ -108,7 +108,7 @@ def test_end_stops_are_at_the_workspace_limits(axis):
     assert 0.0 < side * (after[axis] - centre[axis]) - end < 0.02
     assert np.abs(after[6:]).max() < 0.05
     back = after.copy()
-    back[6 + axis] = -side * 10.0  # out of the stop: it does not hold back
+    back[6 + axis] = -side * 10.0  # out of the stop: the stop exerts no force
     slower = advance(touch, back, np.zeros(6), np.zeros(6), 1, period=1e-6)
     assert side * (slower[6 + axis] - back[6 + axis]) > 0.0 or axis > 2
     with pytest.raises(DrakeTeleopError, match=r"workspace is 0\.235 to 0\.305"):
@@ -119,7 +119,7 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
     fixed, omega = device("omega_3"), device("omega_6")
     inside = np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
     turned, aside = inside + 2.9 * np.eye(6)[5], inside + 0.06 * np.eye(6)[1]
-    # An axis that does not turn is at its end all the time, which is nothing to say.
+    # An axis without rotation is always at its end, which is not reported.
     wobbling = inside + 1e-3 * np.eye(6)[5]
     for model, ends in ((fixed, [False, False, True]), (omega, [False, False, True])):
         np.testing.assert_array_equal(

@@ -48,7 +48,7 @@ def rotation(pose) -> np.ndarray:
     return RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))).matrix()
 
 
-def turn(*vector) -> np.ndarray:
+def rotation_matrix(*vector) -> np.ndarray:
     angle = np.linalg.norm(vector)
     axis = np.array(vector) / angle
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -86,12 +86,12 @@ def test_intent_is_smooth_to_the_second_derivative():
     np.testing.assert_allclose(acceleration[0], 0, atol=1e-9)
 
 
-def test_segments_start_from_rest_and_add_up():
+def test_segments_start_from_rest_and_are_added():
     (first, last), twists = intent_at(SEGMENTS, START, [0.0, 2.0])
     np.testing.assert_array_equal(first, START)
     np.testing.assert_array_equal(twists, 0)
     np.testing.assert_allclose(last[4:], START[4:] + np.array([0.01, 0.02, -0.03]), atol=1e-15)
-    expected = turn(0.0, -0.5, 0.0) @ turn(0.3, 0.0, 0.2)
+    expected = rotation_matrix(0.0, -0.5, 0.0) @ rotation_matrix(0.3, 0.0, 0.2)
     np.testing.assert_allclose(rotation(last), expected, atol=1e-14)
 
 
@@ -151,7 +151,7 @@ def test_hand_force_and_torque_are_limited():
 
 @pytest.mark.parametrize("grip", list(GRIP_IMPEDANCES))
 def test_hand_yields_to_the_displayed_force(grip):
-    """At rest the hand deflects by F / K."""
+    """The hand at rest deflects by F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
     viscous = JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
     config = OperatorConfig(grip=grip)

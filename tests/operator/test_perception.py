@@ -28,12 +28,12 @@ def record(mass: float, steady: float, push: float, amplitude: float = 0.0):
     velocity, force = np.zeros((len(T), 3)), np.zeros((len(T), 3))
     velocity[:, 2] = amplitude * omega * np.sin(omega * T)
     acceleration = amplitude * omega**2 * np.cos(omega * T)
-    # Of the hand on the stylus: it carries, accelerates, and answers the push downwards.
+    # Forces of the hand on the stylus: it carries, accelerates, and resists the push downwards.
     force[:, 2] = steady + mass * acceleration - push * (T >= PUSH)
     return force, velocity
 
 
-def noticed(mass: float, steady: float, push: float, amplitude: float = 0.0, hand_mass=0.0):
+def is_perceived(mass: float, steady: float, push: float, amplitude: float = 0.0, hand_mass=0.0):
     felt = perceive_contact(
         T, *record(mass, steady, push, amplitude), HUMAN, hand_mass, attentive=3.0
     )
@@ -47,18 +47,18 @@ def test_push_is_detected_above_the_just_noticeable_difference(steady):
     """Weber's law, and the absolute threshold for small forces."""
     least = max(HUMAN.absolute_threshold, HUMAN.weber_fraction * steady)
     after = T >= PUSH
-    plain = noticed(0.0, steady, 1.2 * least)
+    plain = is_perceived(0.0, steady, 1.2 * least)
     assert not plain[~after].any()
     first = T[np.argmax(plain)] - PUSH
     assert 0.0 <= first < 0.1
-    assert not noticed(0.0, steady, 0.9 * least).any()
+    assert not is_perceived(0.0, steady, 0.9 * least).any()
 
 
 @pytest.mark.parametrize("push", [0.1, 0.3])
 def test_inertial_force_masks_a_contact(push):
     """1.2 kg at 8.9 m/s^2 give 10.7 N; a push of 0.3 N is below a tenth of it."""
-    assert noticed(0.0, 0.0, push).any()
-    assert not noticed(1.2, 0.0, push, amplitude=0.1).any()
+    assert is_perceived(0.0, 0.0, push).any()
+    assert not is_perceived(1.2, 0.0, push, amplitude=0.1).any()
 
 
 def test_moved_mass_is_learned_and_is_no_contact():
@@ -70,11 +70,11 @@ def test_moved_mass_is_learned_and_is_no_contact():
 
 
 def test_inertial_force_of_the_hand_is_not_perceived():
-    assert noticed(1.2, 0.0, 0.3, amplitude=0.1, hand_mass=1.2).any()
+    assert is_perceived(1.2, 0.0, 0.3, amplitude=0.1, hand_mass=1.2).any()
 
 
 def test_masking_fades_with_its_time_constant():
-    """After a motion the threshold decays as exp(-t / masking_time)."""
+    """The threshold decays as exp(-t / masking_time) after a motion."""
     force, velocity = record(1.2, 0.0, 0.0, 0.1)
     moving = (T < 4.0)[:, np.newaxis]
     felt = perceive_contact(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)

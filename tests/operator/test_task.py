@@ -106,7 +106,7 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     task = Press(translation=[0.03, -0.02, -0.06])
     training = decision.OperatorTraining(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
     person = decision.pack_operator_parameters(training, Perception(), Movement())
-    # As Python, so that nothing else is compiled.
+    # In Python, to avoid compilation.
     monkeypatch.setattr(
         decision, "_contact_force_against_axis", decision._contact_force_against_axis.py_func
     )
@@ -180,22 +180,22 @@ def test_unequal_delays_add_to_one_round_trip(there, back):
 def test_hand_stops_after_contact_detection(touch):
     for result, measures in touch.values():
         assert measures["success"] == 1.0
-        # Not before the reaction time is over.
+        # The press begins after the reaction time.
         assert 0.16 < measures["detection_time_s"] < 0.5
         assert measures["false_notices"] == 0
-        # It has stopped: what the tool does to the leaf no longer changes.
+        # It has stopped: the motion of the tool in the leaf is constant.
         force = contact_force(result)
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
-        # A stop takes its time, and it rests for 0.3 s, the default.
+        # It decelerates, and rests for 0.3 s, the default.
         stopping = result.t[result["task_state"][:, PHASE_INDEX] == PHASE_STOPPING]
         assert np.ptp(stopping) > decision.STOP_DURATION_S + 0.29
-        # And the run ends with the task.
+        # The run ends with the task.
         assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 
 
 @pytest.mark.slow
 def test_rendered_weight_raises_threshold_and_slows_approach(touch):
-    """sigma = 1: the threshold follows the rendered weight, and so does trust."""
+    """The threshold rises with the rendered weight at sigma = 1, and the approach is slower."""
     without, with_load = touch[0.0][1], touch[1.0][1]
     assert with_load["task_time_s"] > without["task_time_s"]
     assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
@@ -212,7 +212,7 @@ def test_search_finds_the_slot_after_an_aim_error():
     result, measures = run("insert", **with_task(task))
     assert measures["success"] == 1.0
     assert (result["task_state"][:, PHASE_INDEX] == PHASE_SEARCHING_SLOT).any()
-    # It stood on the top first: at the force of a push, above the mouth.
+    # It touched the top first: with the force of a push, above the mouth.
     assert measures["detection_time_s"] < 0.5
 
 
@@ -228,7 +228,7 @@ def test_operator_gives_up_without_contact():
 @pytest.mark.long
 @pytest.mark.slow
 def test_set_force_is_held():
-    """Without device friction, which hides 1 N at the tool."""
+    """Device friction, which hides 1 N at the tool, is zero."""
     smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
     task = Press(translation=[0.0, 0.0, -0.08], force=12.0, tolerance=1.2)
     _, measures = run("press", **with_task(task, **smooth), force_scaling__gamma=1.6)
@@ -269,27 +269,27 @@ def test_movements_are_continuous_to_acceleration():
     memory, time, rng = decision.initial_memory(), 0.0, np.random.default_rng(3)
     expected = np.zeros(3)
 
-    def wanted(at):
+    def planned_motion(at):
         pose, twist = np.zeros(7), np.zeros(6)
         add_planned_motion_into(memory, at, pose, twist)
         return pose[4:], twist[:3]
 
     for _ in range(5):
         change, length = rng.normal(size=3) * 0.1, rng.uniform(0.2, 0.5)
-        now, _ = wanted(time)
-        before = wanted(time - 1e-6), wanted(time)
+        now, _ = planned_motion(time)
+        before = planned_motion(time - 1e-6), planned_motion(time)
         plan_move(memory, time, length, change, np.zeros(3))
-        after = wanted(time), wanted(time + 1e-6)
+        after = planned_motion(time), planned_motion(time + 1e-6)
         for place_or_speed in (0, 1):
             slope_before = (before[1][place_or_speed] - before[0][place_or_speed]) / 1e-6
             slope_after = (after[1][place_or_speed] - after[0][place_or_speed]) / 1e-6
             np.testing.assert_allclose(slope_after, slope_before, atol=2e-3)
         np.testing.assert_allclose(after[0][0], before[1][0], atol=1e-14)
         expected = now + change
-        np.testing.assert_allclose(wanted(time + length)[0], expected, atol=1e-14)
-        time += 0.7 * length  # the next one begins before this one is over
-    np.testing.assert_allclose(wanted(time + 1.0)[0], expected, atol=1e-14)
-    np.testing.assert_allclose(wanted(time + 1.0)[1], 0.0, atol=1e-13)
+        np.testing.assert_allclose(planned_motion(time + length)[0], expected, atol=1e-14)
+        time += 0.7 * length  # the next one begins before the end of this one
+    np.testing.assert_allclose(planned_motion(time + 1.0)[0], expected, atol=1e-14)
+    np.testing.assert_allclose(planned_motion(time + 1.0)[1], 0.0, atol=1e-13)
 
 
 def test_the_operators_noise_is_normal():

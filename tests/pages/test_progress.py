@@ -47,23 +47,23 @@ def test_long_functions_show_progress_unless_disabled(function):
         assert "progress" in function.__doc__
 
 
-def shown(progress, **options) -> None:
+def run_with_progress(progress, **options) -> None:
     with show_progress(progress, **options) as stage:
-        told = stage("Counting sheep")
+        update = stage("Counting sheep")
         for fraction in np.linspace(0, 1, 5):
-            told(fraction, f"{fraction:.2f}")
+            update(fraction, f"{fraction:.2f}")
 
 
 def test_terminal_shows_each_stage(terminal):
-    shown(True)
+    run_with_progress(True)
     text = terminal.getvalue()
     assert "Counting sheep" in text and "100%" in text
 
 
 def test_no_output_without_progress(terminal, capsys):
-    shown(False)
-    shown(show_no_progress)
-    shown(True, after=3600.0)  # done before
+    run_with_progress(False)
+    run_with_progress(show_no_progress)
+    run_with_progress(True, after=3600.0)  # done before
     assert terminal.getvalue() == capsys.readouterr().err == ""
 
 
@@ -76,8 +76,8 @@ def test_without_a_terminal_each_stage_is_one_line_on_stderr(monkeypatch, capsys
         for fraction in (0.0, 0.5, 1.0):
             first(fraction, "words")
         stage("Counting goats")(1.0)
-    shown(True, after=3600.0)
-    shown(False)
+    run_with_progress(True, after=3600.0)
+    run_with_progress(False)
     said = capsys.readouterr()
     assert (said.err, said.out, file.getvalue()) == ("Counting goats ...\n", "", "")
 
@@ -85,12 +85,12 @@ def test_without_a_terminal_each_stage_is_one_line_on_stderr(monkeypatch, capsys
 def test_without_a_terminal_the_line_appears_after_the_delay(monkeypatch, capsys):
     monkeypatch.setattr(rich, "_console", Console(file=io.StringIO(), force_terminal=False))
     with show_progress(True, after=0.05) as stage:
-        told = stage("Counting sheep")
-        told(0.1)
+        update = stage("Counting sheep")
+        update(0.1)
         assert capsys.readouterr().err == ""
         time.sleep(0.06)
-        told(0.2)
-        told(0.3)
+        update(0.2)
+        update(0.3)
         assert capsys.readouterr().err == "Counting sheep ...\n"
 
 
@@ -98,13 +98,13 @@ def test_callees_continue_the_stages_of_the_caller(terminal):
     with show_progress(True) as stage, show_progress(stage) as same:
         assert same is stage
     calls = []
-    shown(lambda name: lambda fraction, words="": calls.append((name, fraction)))
+    run_with_progress(lambda name: lambda fraction, words="": calls.append((name, fraction)))
     assert calls[-1] == ("Counting sheep", 1.0) and len(calls) == 5
 
 
 def test_nested_bars_raise_no_error(terminal):
     with show_progress(True) as stage:
         stage("Outside")(0.5)
-        shown(True)
+        run_with_progress(True)
     assert "Outside" in terminal.getvalue()
-    shown(True)
+    run_with_progress(True)

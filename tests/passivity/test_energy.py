@@ -1,8 +1,8 @@
-"""No method gives out energy that was not put in, whatever the network and the ports do.
+"""Every method outputs at most the energy of its input, for any network and motion.
 
-Random motion at both ends, random wrenches, and random networks: delay up to 300 ms, jitter, loss,
-bursts, reordering, duplicates, and a device that saturates. `benchmarks/passivity.py` has the same
-in the large.
+Motion at both ends and wrenches are random, and so are networks: delay up to 300 ms, jitter, loss,
+bursts, reordering, duplicates, and a saturated device. `benchmarks/passivity.py` is a larger
+version.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ def bench() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def least(bench: ModuleType) -> dict[str, dict[str, float]]:
+def energies(bench: ModuleType) -> dict[str, dict[str, float]]:
     return bench.study(networks=14, seconds=4.0, processes=1)
 
 
 @pytest.mark.slow
-def test_tdpa_output_never_exceeds_input(least):
-    assert least["tdpa"]["energy"] >= -1e-9
-    assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
+def test_tdpa_output_never_exceeds_input(energies):
+    assert energies["tdpa"]["energy"] >= -1e-9
+    assert energies["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
 
 
 @pytest.mark.slow
-def test_energy_from_drag_is_released_once(least):
-    assert least["charged_tdpa"]["energy"] >= -1e-9
-    assert least["charged_tdpa"]["stronger"] <= 0.28 + 1e-12, "stronger by more than the drag"
-    assert least["charged_tdpa"]["stronger"] > 0.2, "there should have been drag"
+def test_energy_from_drag_is_released_once(energies):
+    assert energies["charged_tdpa"]["energy"] >= -1e-9
+    assert energies["charged_tdpa"]["stronger"] <= 0.28 + 1e-12, "stronger by more than the drag"
+    assert energies["charged_tdpa"]["stronger"] > 0.2, "there should have been drag"
 
 
 @pytest.mark.slow
-def test_wave_output_is_the_received_energy(least):
-    assert least["wave"]["energy"] >= -1e-9
-    assert least["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
+def test_wave_output_is_the_received_energy(energies):
+    assert energies["wave"]["energy"] >= -1e-9
+    assert energies["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
 
 
 @pytest.mark.slow
-def test_a_tank_is_never_overdrawn_at_the_true_port_of_a_held_wrench(least):
-    assert least["two_layer"]["true_energy"] >= -1e-9
-    assert least["two_layer"]["tank"] >= -1e-9
-    assert least["two_layer_no_margin"]["tank"] < -1e-5, "the margin should have mattered"
+def test_a_tank_is_never_overdrawn_at_the_true_port_of_a_held_wrench(energies):
+    assert energies["two_layer"]["true_energy"] >= -1e-9
+    assert energies["two_layer"]["tank"] >= -1e-9
+    assert energies["two_layer_no_margin"]["tank"] < -1e-5, "the margin should have mattered"
 
 
 @pytest.mark.slow
-def test_energy_is_created_without_a_method(least):
-    assert least["none"]["energy"] < -1.0
+def test_energy_is_created_without_a_method(energies):
+    assert energies["none"]["energy"] < -1.0

@@ -20,7 +20,7 @@ T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
 
 
-def test_motion_and_force_of_both_ends_with_local_feedback():
+def test_motion_and_force_equal_the_equations_with_local_feedback():
     own = FourChannelConfig([70.0, 0.7], [4.0, 0.03], slave_feedback=0.3, hand_feedback=-0.4)
     p = method_parameters(
         PassivityConfig("four_channel", force_limit=1e4, torque_limit=1e3, four_channel=own)

@@ -1,7 +1,7 @@
-"""The energy ledger: its promises, each at its port, in one degree of freedom.
+"""Energy ledger in one degree of freedom: energy limits at each port, and rendered forces.
 
-Walls, networks and hands of `drake_teleop.lab.comparison.one_dof`; the method has no data of the
-hand.
+Walls, networks and hands are those of `drake_teleop.lab.comparison.one_dof`; the method has no data
+of the hand.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 CHARGED_BY_DRAG = PassivityConfig(method="ledger", ledger=LedgerConfig(initial=[0.0, 0.0]))
 CHARGED_BEFORE = PassivityConfig(method="ledger")
 LIGHT, MEDIUM, FIRM = (0.1, 2.0, 50.0), (0.25, 8.0, 250.0), (0.5, 20.0, 700.0)
-PATIENT = 1.0  # s, a time-out that the networks here do not reach
+PATIENT = 1.0  # s, a time-out above any silence of these networks
 
 
 def model(grip=MEDIUM, wall=5100.0, **imperfect):
@@ -69,16 +69,16 @@ def moving(x: np.ndarray) -> np.ndarray:
 
 
 def charging(t: np.ndarray, press: float, depth: float) -> np.ndarray:
-    """Swings before the wall until 3 s, presses as deep within a second, holds."""
+    """Return swings before the wall until 3 s, then a press as deep within 1 s, and rest."""
     u = np.clip(t - press, 0.0, 1.0)
     swing = 0.03 * np.sin(3.0 * np.pi * t) * (t < 3.0)
     return moving(-0.04 + swing + (depth + 0.04) * u**3 * (10.0 + u * (6.0 * u - 15.0)))
 
 
 def hard_taps(seed: int, passivity: PassivityConfig, **imperfect) -> OneDofRun:
-    """Taps over bursts of loss, of a hand that lets go at last, on walls that come and go.
+    """Simulate taps with bursts of loss; walls appear and disappear, and the hand is released.
 
-    A wall that goes keeps what was put into it; every other one comes back elsewhere, and pushes.
+    A wall that disappears keeps its energy; every other one appears elsewhere, and pushes.
     """
     rng, t = np.random.default_rng(seed), times(6.0)
     rate, reach = rng.uniform(1.0, 3.0), rng.uniform(0.02, 0.04)
@@ -100,9 +100,9 @@ def hard_taps(seed: int, passivity: PassivityConfig, **imperfect) -> OneDofRun:
 
 @pytest.mark.parametrize("seed", [1, 9])
 def test_no_energy_is_created_at_the_actual_motion(seed):
-    """From E_0 on, and from nothing if drag earns it.
+    """The initial energy is E_0 or none; drag charges the ledger.
 
-    Of 40 seeds these are the ones in which motors that are not held to the account give out most.
+    These of 40 seeds create the most energy if the balance does not limit the motors.
     """
     for passivity in (CHARGED_BY_DRAG, CHARGED_BEFORE):
         run = hard_taps(seed, passivity)
@@ -113,7 +113,7 @@ def test_no_energy_is_created_at_the_actual_motion(seed):
 
 @pytest.mark.parametrize(("step", "known"), [(5.5e-5, 5.5e-5), (2e-4, 2e-4), (2e-4, 5e-5)])
 def test_no_energy_is_created_with_encoder_steps(step, known):
-    """Steps of the hand's encoder that the method knows, or that are larger than it knows."""
+    """The encoder step is the configured one or larger."""
     ledger = LedgerConfig(encoder_step=[known, 0.0])
     run = hard_taps(1, PassivityConfig(method="ledger", ledger=ledger), master_resolution=step)
     assert run.least_energy_sum(ACTUAL) >= -1e-6 and run.least_energy_sum(MOTOR) >= -1e-6
@@ -122,7 +122,7 @@ def test_no_energy_is_created_with_encoder_steps(step, known):
 
 @pytest.mark.parametrize("delay", [5e-4, 0.15])
 def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
-    """The fit of the bounces must not keep the motion alive."""
+    """The fit of the bounces must not sustain the motion."""
     axis = model(LIGHT, 50e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
     assert run.wall_force[run.t < 4.0].min() < -50.0, "it should have hit the wall"
@@ -142,7 +142,7 @@ def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
 
 
 def test_ledger_is_input_minus_output_and_keeps_its_deficit():
-    """At every step of both ends, also with a hand that is only pushed."""
+    """The balance holds at every step of both ends, also for a hand that is only pushed."""
     p, method = method_parameters(CHARGED_BY_DRAG), step_addresses("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     ends = [initial_method_memory("ledger", p, start) for _ in range(2)]
@@ -195,9 +195,9 @@ def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
 
 @pytest.mark.parametrize("seed", [4, 38])
 def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
-    """Pressing hard through silences, with motors that are late: of 40 seeds, where most is lost.
+    """The hand presses hard during silences, with delayed motors: worst seeds of 40.
 
-    In 38 if the safe state has the last word; in 4 if the motors may brake with all that it asks.
+    38 fail if the safe state takes precedence; 4 if the motors may brake with all that it requests.
     """
     rng, t = np.random.default_rng(seed), times(8.0)
     grip = rng.uniform(0.1, 0.4), 8.0, rng.uniform(200.0, 600.0)
@@ -225,7 +225,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     ],
 )
 def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
-    """Without initial energy and without information about the hand."""
+    """The ledger has no initial energy and no information about the hand."""
     task = Task(
         press_start=3.5,
         press_end=4.5,
@@ -260,7 +260,7 @@ def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay
 
 @pytest.mark.parametrize("grip", [MEDIUM, FIRM])
 def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
-    """At 300 ms: 20 kN/m are 1.1 kN/m at the hand; the first second displays 300 N/m."""
+    """20 kN/m are displayed as 1.1 kN/m at a delay of 300 ms; the first second displays 300 N/m."""
     axis = model(grip, 20e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
     found, hard = (
@@ -272,7 +272,7 @@ def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
 
 
 def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
-    """48 ms without a packet, at a round trip of 100 ms."""
+    """No packet arrives for 48 ms, at a round trip of 100 ms."""
     network = NetworkConfig(delay=0.05, loss=0.01, burst=0.02)
     run = run_one_dof(
         model(FIRM, 15e3), CHARGED_BEFORE, network, seed=4, timeout=PATIENT,
@@ -315,7 +315,7 @@ def test_released_hand_is_not_accelerated(delay):
 
 @pytest.mark.parametrize("wall", [5.1e3, 20e3])
 def test_removed_wall_is_rendered_briefly(wall):
-    """Taps at 1 Hz: once more, until the slave was there; the round trip is 100 ms."""
+    """Taps at 1 Hz: the wall is rendered once more, until the slave has been there; RTT 100 ms."""
     t = times(10.0)
     x = -0.01 - 0.025 * np.cos(2.0 * np.pi * t)
     there = np.stack([np.zeros(len(t)), np.where(t < 5.05, wall, 0.0)], axis=1)
@@ -334,9 +334,9 @@ def test_removed_wall_is_rendered_briefly(wall):
     ids=["light", "medium", "firm"],
 )
 def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
-    """It keeps what was put into it, and so a part of the reserves: no reason for drag yet.
+    """The wall keeps a part of the reserves, but this is no reason for drag yet.
 
-    A light hand presses with less than the 1 N that tell at once.
+    A light hand presses with less than the threshold of 1 N for immediate detection.
     """
     t = times(7.0)
     there = np.stack([np.zeros(len(t)), np.where(t < 6.0, 5.1e3, 0.0)], axis=1)
@@ -356,7 +356,7 @@ def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
     ids=["a touch", "hardly in", "hard"],
 )
 def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
-    """Except the drag of 0.28 N that refills the ledger."""
+    """The remaining force is the drag of 0.28 N that refills the ledger."""
     t = times(7.0)
     there = np.stack([np.zeros(len(t)), np.where(t < 6.0, wall, 0.0)], axis=1)
     run = run_one_dof(
@@ -371,7 +371,7 @@ def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
 
 @pytest.mark.parametrize("rate", [0.7, 1.5])
 def test_taps_are_rendered_from_the_second_on(rate):
-    """Packets of each tap arrive after it: the remembered wall replaces them."""
+    """Packets of each tap arrive after it: the stored wall replaces them."""
     t = times(9.0)
     x = charging(t, 20.0, 0.0)[:, 0]
     x = np.where(t < 3.2, x, -0.015 + 0.025 * np.cos(2.0 * np.pi * rate * (t - 3.2) + np.pi))

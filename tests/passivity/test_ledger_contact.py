@@ -1,6 +1,6 @@
-"""The energy ledger in six degrees of freedom: a contact is one wrench, with friction across it.
+"""Energy ledger in six degrees of freedom: contact is one wrench, with friction across it.
 
-Both ends are stepped by themselves, with packets that are written here.
+Both ends are stepped separately with constructed packets.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ class Hand:
         ledger = dataclasses.replace(RICH.ledger, **own)
         self.p = method_parameters(dataclasses.replace(RICH, ledger=ledger))
         self.memory = initial_method_memory("ledger", self.p, START)
-        self.memory[STORED_ENERGY] = 0.2  # more than it needs, and no more than it keeps in contact
+        self.memory[STORED_ENERGY] = 0.2  # more than it uses, and below its limit in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
         self.packet[POSE], self.packet[WRENCH] = START, wrench
         self.packet[PACKET_CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
 
     def step(self, dx: np.ndarray | None = None) -> np.ndarray:
-        """Moves by dx (6,), translation and small turn; what it feels then."""
+        """Move by dx (6,), translation and small rotation; return the rendered wrench."""
         dx = np.zeros(6) if dx is None else np.asarray(dx)
         self.pose[4:] += dx[:3]
         self.pose[1:4] += 0.5 * dx[3:]
@@ -89,7 +89,7 @@ class Hand:
         return self.felt.copy()
 
     def rest(self, steps: int) -> np.ndarray:
-        """What it feels after standing still."""
+        """Return the rendered wrench after a number of steps at rest."""
         for _ in range(steps):
             felt = self.step()
         return felt
@@ -99,7 +99,7 @@ def test_contact_far_from_the_reference_is_one_spring():
     """The depth is that of the contact point for translation and rotation, with the torque."""
     arm, k = np.array([0.0, 0.1, 0.0]), 200.0
     normal = np.array([0.0, 0.0, 1.0, *np.cross(arm, [0.0, 0.0, 1.0])])
-    component_along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, a torque being a force at 0.1 m
+    component_along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, where a torque is a force at 0.1 m
     depth = 1e-3
     for way in ([0, 0, -depth, 0, 0, 0], [0, 0, 0, -depth / 0.1, 0, 0]):
         hand = Hand(2.0 * normal, k * component_along)
@@ -114,7 +114,7 @@ def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
     wrench = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     hand = Hand(wrench, 200.0)
     hand.rest(1500)
-    hand.packet[WRENCH][1] = -0.6  # slides, as the hand did a while ago
+    hand.packet[WRENCH][1] = -0.6  # slides, as the hand did earlier
     assert abs(hand.rest(20)[1]) < 0.1
     for sign in (1.0, -1.0):
         for _ in range(20):
@@ -122,7 +122,7 @@ def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
         assert felt[1] == pytest.approx(-sign * 0.6, rel=0.3)
         assert felt[2] == pytest.approx(3.0, rel=0.1)
     np.testing.assert_allclose(hand.rest(7000)[:3], [0.0, -0.6, 3.0], atol=0.01)
-    hand.packet[POSE][6] = -0.1  # the hand is far out again, before the slave's news are
+    hand.packet[POSE][6] = -0.1  # the hand is far out again, before the slave's packets arrive
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
     still = hand.step([0.0, 5e-5, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(still, np.zeros(6), atol=1e-9, err_msg="nor where it moves there")
@@ -184,7 +184,7 @@ def test_friction_force_along_the_contact_is_removed(turns):
         hand.step([0.0, 0.0, 0.0, turns, 0.0, 0.0])
     hand.packet[POSE] = hand.pose
     felt = hand.rest(9000)
-    assert felt[2] == pytest.approx(3.0, abs=0.05)  # but for what the direction still has to turn
+    assert felt[2] == pytest.approx(3.0, abs=0.05)  # up to the remaining rotation of the direction
     assert abs(felt[1]) < 0.05
 
 
@@ -192,7 +192,7 @@ def test_friction_opposes_a_hand_that_reverses_before_the_slave_does():
     """The slave slides 100 ms behind the hand, and meets the friction of its own motion."""
     hand, delay, speed = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0), 100, 5e-5
     hand.rest(1500)
-    ways = np.repeat([speed, -speed], [400, 60])  # short: the direction turns to the friction
+    ways = np.repeat([speed, -speed], [400, 60])  # short: the direction rotates to the friction
     for k, way in enumerate(ways):
         late = ways[k - delay] if k >= delay else 0.0
         hand.packet[POSE][5] += late
@@ -204,7 +204,7 @@ def test_friction_opposes_a_hand_that_reverses_before_the_slave_does():
 
 
 def test_noise_of_a_light_contact_is_no_large_friction():
-    """0.5 N across 0.2 N is no coefficient of friction of 2.5."""
+    """0.5 N across 0.2 N is not a coefficient of friction of 2.5."""
     hand = Hand(np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]), 200.0)
     hand.rest(1500)
     for k in range(20):
@@ -216,7 +216,7 @@ def test_noise_of_a_light_contact_is_no_large_friction():
 
 
 def test_friction_stays_across_the_direction_as_it_turns():
-    """The contact is beside So, the hand moves in all axes, and no limit is reached."""
+    """The contact is beside So, the hand moves in all axes, and no limit is active."""
     rng = np.random.default_rng(4)
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.2, 0.0, 0.0]), 0.0)
     hand.rest(100)
@@ -234,7 +234,7 @@ def test_friction_stays_across_the_direction_as_it_turns():
 
 @pytest.mark.parametrize(("round_trip", "lag"), [(0.01, 0.6), (0.1, 3.0), (0.3, 9.0)])
 def test_torque_across_the_contact_is_a_stiffer_spring_with_a_longer_lag(round_trip, lag):
-    """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction turns within 3 s."""
+    """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction rotates within 3 s."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = round_trip
     hand.rest(1500)
@@ -313,7 +313,7 @@ def test_released_hand_receives_at_most_its_ledger():
 
 @pytest.mark.parametrize("known", [0.0, 3e-5])
 def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder(known):
-    """A hand that oscillates by one encoder step needs a force on the way in as well."""
+    """A hand that oscillates by one encoder step needs a force on the inward step as well."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[known, 0.0])
     got, step = 0.0, 3e-5
     hand.memory[STORED_ENERGY] = 0.0
@@ -327,8 +327,8 @@ def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder(known):
 
 @pytest.mark.parametrize("axis", [0, 2, 4])
 def test_hand_at_the_border_of_two_encoder_steps_receives_a_constant_force(axis):
-    """Reading of one step to and fro, for a hand that rests or has moved before, either way."""
-    step = 5.5e-5 if axis < 3 else 2e-4  # one step in a millisecond is no fast hand
+    """The reading oscillates by one step at rest, or after motion in either direction."""
+    step = 5.5e-5 if axis < 3 else 2e-4  # one step in a millisecond is not a fast hand
     changes = {}
     for known in (step, 0.0):
         steps = [known, 0.0] if axis < 3 else [0.0, known]
@@ -346,8 +346,8 @@ def test_hand_at_the_border_of_two_encoder_steps_receives_a_constant_force(axis)
     assert max(changes[step]) < 0.02 * min(changes[0.0])
 
 
-def test_lost_motion_of_the_encoder_is_its_step_and_no_more():
-    """A hand that moves on receives the force of its pose but for 1.1 steps of lost motion."""
+def test_lost_motion_of_the_encoder_is_at_most_its_step():
+    """A hand that moves on receives the force of its pose minus 1.1 steps of lost motion."""
     forces = []
     for step in (0.0, 5e-5):
         hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 800.0, encoder_step=[step, 0.0])
@@ -361,7 +361,7 @@ def test_lost_motion_of_the_encoder_is_its_step_and_no_more():
 
 @pytest.mark.parametrize(("step", "axis"), [(5e-5, 4), (2e-4, 6)])
 def test_slave_receives_the_pose_of_the_hand_without_flicker(step, axis):
-    """It stays while the reading goes to and fro, and follows a hand that moves on."""
+    """The pose is constant while the reading oscillates, and follows a hand that moves on."""
     hand, dx = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[step, 0.0]), 0.0
     sent = []
     for k in range(40):
@@ -384,7 +384,7 @@ def test_encoder_step_is_scaled_like_the_motion_of_the_hand(scale):
 
 @pytest.mark.parametrize("known", [0.0, 3e-5, 3e-4])
 def test_balance_counts_the_measured_motion_within_the_lost_motion(known):
-    """A third of the reserve, which is not sent on: 3 N times each measured step."""
+    """A third of the reserve remains at this end: 3 N times each measured step."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[known, 0.0])
     hand.rest(1500)
     start = hand.memory[STORED_ENERGY][0] = RICH.ledger.hand_reserve[0] / 3
@@ -398,7 +398,7 @@ def test_balance_counts_the_measured_motion_within_the_lost_motion(known):
 
 
 def test_energy_limit_counts_a_measured_step_within_the_lost_motion():
-    """0.3 mJ remain: a hand that was pushed back by a known step of 50 um receives less at once."""
+    """Energy of 0.3 mJ remains: a hand that a step of 50 um pushes back receives less at once."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0, encoder_step=[5e-5, 0.0])
     full = hand.rest(1500)[2]
     hand.memory[STORED_ENERGY][0] = 0.05 * RICH.ledger.hand_reserve[0] + 3e-4
@@ -460,9 +460,9 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
 
 
 def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
-    """On a wall of 200 N/m, 0.1 m below So: 0.5 N that held it sideways let go, then 1 N is gone.
+    """0.5 N of lateral force on a wall of 200 N/m disappear, and then 1 N of contact force.
 
-    The mean of force and friction is no normal, so that the slip is a step along it, by 0.3 N.
+    The mean of force and friction is not a normal, so that the slip is a step along it, by 0.3 N.
     """
     p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
@@ -488,7 +488,7 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
 
 
 def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
-    """18 N at a lever of 40 mm at the slave, in power units at three scales."""
+    """A contact of 18 N at a lever of 40 mm at the slave, in power units at three scales."""
     config = PassivityConfig(method="ledger")
     contact = np.array([0.0, 0.0, 18.0, 0.0, 0.7, 0.0])
     sizes = []
@@ -506,9 +506,9 @@ def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
 
 
 def test_weight_of_the_load_is_rendered_beside_a_contact():
-    """Lowered onto a wall of 200 N/m: the account is of all, touch and prediction are of the wall.
+    """A wall of 200 N/m: the balance is that of all forces, contact detection that of the wall.
 
-    A load that shakes is felt smoothed, over a round trip and the servo's lag.
+    The force of an oscillating load is smoothed over a round trip and the servo's lag.
     """
     p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
@@ -534,7 +534,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
     )
     stiffness = packet[PACKET_CONTACT_STIFFNESS]
     assert stiffness == pytest.approx(200.0, rel=0.05)
-    # The packets take what is passed on to the hand, which has nothing here.
+    # Packets of this hand need no energy for the slave.
     books = (
         memory[STORED_ENERGY][0] + memory[SENT_ENERGY][0] + memory[DISSIPATED_ENERGY][0] - stored
     )

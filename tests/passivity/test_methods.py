@@ -54,7 +54,7 @@ START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
 
 
 def poses(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """(steps, 7) a smooth random motion from `START` in all six degrees of freedom."""
+    """Return (steps, 7): a smooth random motion from `START` in all six degrees of freedom."""
     t = np.arange(steps) * T
     pose = np.tile(START, (steps, 1))
     phase, rate = rng.uniform(0, 6, 6), rng.uniform(3, 12, 6)
@@ -65,7 +65,7 @@ def poses(rng: np.random.Generator, steps: int) -> np.ndarray:
 
 
 def wrenches(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """(steps, 6) a random contact wrench that is zero half of the time."""
+    """Return (steps, 6): a random contact wrench that is zero half of the time."""
     t = np.arange(steps) * T
     f = np.array([6.0, 6.0, 6.0, 0.1, 0.1, 0.1]) * np.sin(
         np.outer(t, rng.uniform(2, 30, 6)) + rng.uniform(0, 6, 6)
@@ -74,7 +74,7 @@ def wrenches(rng: np.random.Generator, steps: int) -> np.ndarray:
 
 
 def run(method, config, master_poses, slave_poses, f_e, newest):
-    """Both ends over a line on which packet `newest[way, k]` is the newest at step k (-1: none).
+    """Simulate both ends; packet `newest[way, k]` is the newest at step k (-1: none).
 
     Returns:
         wrench at the hand (N, 6), command of the slave (N, 13), both packets (2, N, PACKET_SIZE),
@@ -108,7 +108,7 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
 
 
 def line(rng: np.random.Generator, steps: int, delay: int = 20, jitter: int = 20) -> np.ndarray:
-    """(2, steps) newest packets of a line that delays, reorders and loses a tenth."""
+    """Return (2, steps) newest packets of a line that delays, reorders and loses a tenth."""
     newest = np.full((2, steps), -1)
     for way in range(2):
         arrival = np.arange(steps) + delay + rng.integers(0, jitter + 1, steps)
@@ -138,7 +138,7 @@ def test_outputs_are_finite_limited_and_numbered(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_world_axes_do_not_matter(method):
+def test_result_is_independent_of_the_world_axes(method):
     """A constant rotation of all inputs rotates the outputs."""
     rng = np.random.default_rng(2)
     config = PassivityConfig(method=method)
@@ -150,21 +150,21 @@ def test_the_world_axes_do_not_matter(method):
     )
     R = normalized_quaternion(tuple(rng.normal(size=4)))
 
-    def turned(vectors):
+    def rotated(vectors):
         return np.array([[*rotate_vector(R, v[:3]), *rotate_vector(R, v[3:6])] for v in vectors])
 
-    def turned_poses(x):
+    def rotated_poses(x):
         return np.array(
             [[*quaternion_product(R, tuple(row[:4])), *rotate_vector(R, row[4:])] for row in x]
         )
 
     wrench, command, *_ = run(method, config, master, slave, f_e, newest)
     wrench_R, command_R, *_ = run(
-        method, config, turned_poses(master), turned_poses(slave), turned(f_e), newest
+        method, config, rotated_poses(master), rotated_poses(slave), rotated(f_e), newest
     )
-    np.testing.assert_allclose(wrench_R, turned(wrench), atol=1e-8)
-    np.testing.assert_allclose(command_R[:, :7], turned_poses(command[:, :7]), atol=1e-9)
-    np.testing.assert_allclose(command_R[:, 7:], turned(command[:, 7:]), atol=1e-6)
+    np.testing.assert_allclose(wrench_R, rotated(wrench), atol=1e-8)
+    np.testing.assert_allclose(command_R[:, :7], rotated_poses(command[:, :7]), atol=1e-9)
+    np.testing.assert_allclose(command_R[:, 7:], rotated(command[:, 7:]), atol=1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -278,12 +278,12 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
     model, task = OneDof(wall_stiffness=wall), Task(release_start=15.5, release_end=16.5, end=21.0)
     network = NetworkConfig(delay=round_trip / 2, jitter=0.25, loss=0.1)
 
-    def found(method):
+    def figures_of(method):
         passivity = PassivityConfig(method=method)
         run = run_one_dof(model, passivity, network, intent=operator_intent(task))
         return figures_of_run(run, model, task)
 
-    charged, strict = found("charged_tdpa"), found("tdpa")
+    charged, strict = figures_of("charged_tdpa"), figures_of("tdpa")
     assert charged.stable and abs(charged.force_error) < 0.01
     assert abs(charged.drift) < 0.5e-3 and charged.free_force < 0.3
     assert charged.rise_delay < 0.5 * round_trip + 0.25, "the quick onset should have come"
@@ -323,7 +323,7 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
 
 
 def test_tank_with_fastest_sending_is_not_overdrawn():
-    """A thousand times its content in a second, each millisecond and each 10 ms."""
+    """The sent energy is 1000 times its content in a second, each millisecond and each 10 ms."""
     p = method_parameters(
         PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0))
     )

@@ -37,7 +37,7 @@ def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
 
 
 def test_pairs_differ_by_the_work_of_a_step():
-    """For a sampled spring `mean` is exact; the others differ by k dx^2 / 2."""
+    """`mean` is exact for a sampled spring; the others differ by k dx^2 / 2."""
     x, k = np.array([0.0, 0.1, 0.15, 0.4]), 7.0
     pose, wrench = np.zeros((4, 7)), np.zeros((4, 6))
     pose[:, 0], pose[:, 4], wrench[:, 0] = 1.0, x, -k * x
@@ -51,11 +51,11 @@ def test_pairs_differ_by_the_work_of_a_step():
 def test_tdpa_ledger_is_the_work_at_the_hand():
     rng = np.random.default_rng(5)
     master, f_e = poses(rng, 1200), wrenches(rng, 1200)
-    config = PassivityConfig(method="tdpa", retreat=[1e3, 1e3])  # what that withholds is lost
+    config = PassivityConfig(method="tdpa", retreat=[1e3, 1e3])  # withheld energy is lost
     wrench, _, _, _, memory = run("tdpa", config, master, poses(rng, 1200), f_e, line(rng, 1200))
     hand, slave = energy_balance(memory[0]), energy_balance(memory[1])
     put_in = -port_work(wrench, master, "backward")[-1]
-    # What was put in is sent, kept, or was balanced by what came from the slave.
+    # Input energy is sent, stored, or balanced by energy from the slave.
     kept = put_in - hand.sent + hand.received - hand.stored
     assert (kept >= -1e-12).all() and (kept <= [2e-3 + 1e-12, 1e-4 + 1e-12]).all()
     assert (energy_in_flight(hand, slave) >= 0.0).all() and (hand.lost > 0.0).any()

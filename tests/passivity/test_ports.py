@@ -1,8 +1,8 @@
-"""What the methods promise about energy, each at its port, over the worst network that is at hand.
+"""Energy limits of the methods at each port over a network with long bursts of loss.
 
 A hand presses deep and slowly, and two packets of five are lost, in bursts of 0.3 s: commands jump,
-and with a short time-out the safe state moves them too. What is promised at the slave's command is
-tested in six degrees of freedom too, where anything may move and push. `ledger` has its own file.
+and with a short time-out the safe state moves them too. Limits at the slave's command are also
+tested in six degrees of freedom with arbitrary motion and wrenches. `ledger` has its own file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from drake_teleop.station.passivity.wave import WaveConfig
 MEDIUM = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
 
 
-def pressed(method: str, seed: int, timeout: float) -> OneDofRun:
+def press_deeply(method: str, seed: int, timeout: float) -> OneDofRun:
     t = np.arange(6000) * PERIOD
     x = 0.055 * (0.45 + 1.5 * np.sin(0.9 * np.pi * t + 1.0))
     x = -0.04 + np.minimum(t / 0.5, 1.0) * (x + 0.04)
@@ -49,8 +49,8 @@ def pressed(method: str, seed: int, timeout: float) -> OneDofRun:
     return found
 
 
-def in_bursts(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """As `line`, but for up to 0.15 s at a time nothing comes."""
+def burst_line(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """Return newest packets as `line`, with gaps of up to 0.15 s."""
     newest = line(rng, steps)
     for way in newest:
         for start in range(0, steps, 250):
@@ -61,7 +61,7 @@ def in_bursts(rng: np.random.Generator, steps: int) -> np.ndarray:
 
 @pytest.mark.parametrize("method", ["wave", "tdpa", "charged_tdpa"])
 def test_backward_pair_creates_no_energy_between_hand_and_command(method):
-    """For each group; the wrench is limited and does not fade."""
+    """The balance holds for each group; the wrench is limited and does not fade."""
     rng, steps = np.random.default_rng(7), 3000
     config = PassivityConfig(
         method=method,
@@ -71,7 +71,7 @@ def test_backward_pair_creates_no_energy_between_hand_and_command(method):
     )
     master, f_e = poses(rng, steps), wrenches(rng, steps)
     wrench, command, _, dx, _ = run(
-        method, config, master, poses(rng, steps), f_e, in_bursts(rng, steps)
+        method, config, master, poses(rng, steps), f_e, burst_line(rng, steps)
     )
     step = np.zeros(6)
     energy = np.zeros((steps, 2))
@@ -87,26 +87,26 @@ def test_backward_pair_creates_no_energy_between_hand_and_command(method):
 @pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
 def test_tdpa_creates_at_most_the_kinetic_energy_at_the_slave(method, seed, timeout):
     """A jump of the command, and one by the safe state, released 0.96 to 1.2 J."""
-    found = pressed(method, seed, timeout)
+    found = press_deeply(method, seed, timeout)
     moving = 0.5 * MEDIUM.force_scale * MEDIUM.slave_mass * TdpaConfig().speed[0] ** 2
     assert found.least_energy_sum(ACTUAL) > -moving
     assert found.least_energy_sum(COMMAND) > -1e-3  # the hand's pair is the held one here
 
 
 def test_wave_end_releases_only_received_energy():
-    """Of what came at hand or command, and by the network, all is in store, sent on or lost.
+    """Energy from hand, command and network is stored, sent or lost.
 
-    A wave that is played without being paid for is missing here at once, and at the ports only if
-    somebody finds the motion that takes it.
+    This balance detects every wave without received energy; the balance of the ports requires a
+    motion that extracts it.
     """
     rng, steps = np.random.default_rng(7), 3000
     config = PassivityConfig(
         method="wave", force_limit=3.0, torque_limit=0.05, retreat=[1e3, 1e3],
-        wave=WaveConfig(drift_rate=0.0),  # whose steps are a gift
+        wave=WaveConfig(drift_rate=0.0),  # its steps add energy
     )  # fmt: skip
     master, f_e = poses(rng, steps), wrenches(rng, steps)
     wrench, command, *_, memory = run(
-        "wave", config, master, poses(rng, steps), f_e, in_bursts(rng, steps)
+        "wave", config, master, poses(rng, steps), f_e, burst_line(rng, steps)
     )
     at_hand = -port_work(wrench, master, "backward")[-1]
     at_command = port_work(f_e, command[:, :7], "backward")[-1]
@@ -132,8 +132,8 @@ def test_tdpa_repays_the_energy_of_a_tap():
 def test_tdpa_repays_a_deficit_before_it_sends(method):
     """The slave goes 30 mm into a wall that pushes with 2 N, and is pushed 60 mm out again.
 
-    The hand has paid little: in a whole run the energy of `charged_tdpa`'s drag hides a debt that
-    was forgotten.
+    The hand supplies little energy: in a whole run the drag of `charged_tdpa` would hide a lost
+    deficit.
     """
     steps = 900
     master, slave = np.tile(START, (2, steps, 1))
@@ -151,25 +151,25 @@ def test_tdpa_repays_a_deficit_before_it_sends(method):
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_tanks_cover_a_jump_of_the_command(seed):
-    """Without the servo's own acceleration 0.18 and 0.33 J were created."""
-    found = pressed("two_layer", seed, 1.0)
+    """Energy of 0.18 and 0.33 J was created without the servo's own acceleration."""
+    found = press_deeply("two_layer", seed, 1.0)
     assert found.least_energy_sum(ACTUAL) >= 0.0 and found.least_energy_sum(MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(3, 0.1), (4, 1.0)])
 def test_set_position_modulation_creates_no_energy_at_motor_and_slave(seed, timeout):
-    found = pressed("pspm", seed, timeout)
+    found = press_deeply("pspm", seed, timeout)
     assert found.least_energy_sum(ACTUAL) >= 0.0 and found.least_energy_sum(MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(2, 0.1), (4, 1.0)])
 def test_waves_create_no_energy_at_the_command(seed, timeout):
-    assert pressed("wave", seed, timeout).least_energy_sum(COMMAND) >= -1e-9
+    assert press_deeply("wave", seed, timeout).least_energy_sum(COMMAND) >= -1e-9
 
 
 def test_force_limit_bounds_the_rendered_force():
     """The bound is reached: the wall's force is twice as large."""
-    found = pressed("force_limit", 2, 1.0)
+    found = press_deeply("force_limit", 2, 1.0)
     limit = ForceLimitConfig().force
     assert MEDIUM.force_scale * np.abs(found.wall_force).max() > 2.0 * limit
     assert np.abs(found.hand_force).max() == pytest.approx(limit, rel=1e-12)

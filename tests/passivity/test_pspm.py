@@ -1,4 +1,4 @@
-"""Passive set-position modulation: its ledger is the energy of the true port, to rounding."""
+"""Passive set-position modulation: its ledger equals the energy of the actual port."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ def groups(values):
 
 
 @pytest.mark.parametrize("end", ["master", "slave"])
-def test_stored_energy_is_what_was_put_in(end):
+def test_stored_energy_is_input_minus_output(end):
     """E + spring = E_0 + received - sent - lost - work of the held wrench, at every step.
 
-    Wrench and spring are found from what the end puts out, not from its memory.
+    Wrench and spring are computed from the outputs, not from the memory.
     """
     rng = np.random.default_rng(4)
     config = PassivityConfig(
         method="pspm",
         servo_stiffness=[300.0, 5.0],
         servo_damping=[2.0, 0.02],
-        retreat=[1e3, 1e3],  # else the wrench does not tell the spring
+        retreat=[1e3, 1e3],  # otherwise the wrench does not determine the spring
     )
     p, m = method_parameters(config), step_addresses("pspm")
     memory = initial_method_memory("pspm", p, START)
@@ -111,7 +111,7 @@ def test_stored_energy_is_what_was_put_in(end):
     assert largest > 0.01, "nothing happened"
 
 
-def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
+def test_wrench_is_limited_before_the_spring_stores_energy():
     """The damper acts beyond the limit; a withheld wrench costs no energy."""
     p, m, rng = (
         method_parameters(PassivityConfig(method="pspm")),
@@ -139,7 +139,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
 
 
 def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
-    """The ledger pays for additional energy of the spring, by group."""
+    """The ledger contains the additional energy of the spring, by group."""
     monkeypatch.setattr(pspm, "dot_of_group", pspm.dot_of_group.py_func)
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
     p, rng = method_parameters(config), np.random.default_rng(1)

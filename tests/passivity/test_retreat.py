@@ -39,7 +39,7 @@ def test_only_wrench_along_a_fast_hand_fades():
 
     def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
         memory, wrench = np.zeros(MEMORY_SIZE), given.copy()
-        fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
+        fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: no filtering
         wrench[:] = given
         fade_retreat_wrench(now, 1e-9, p, memory, wrench)
         np.testing.assert_array_equal(memory[LAST_WRENCH], wrench)
@@ -48,7 +48,7 @@ def test_only_wrench_along_a_fast_hand_fades():
     for speed, share in ((-9.0, 1.0), (0.99, 1.0), (1.5, 0.5), (2.0, 0.0), (9.0, 0.0)):
         twist = speed * np.repeat([0.2, 1.0], 3) * along
         np.testing.assert_allclose(left(twist, twist), share * np.array([5.0, 2.0]), atol=1e-6)
-    # A hand that slows by 1 m/s^2 and 2 rad/s^2 within the filter's 4 ms feels a mass of 2 kg.
+    # Deceleration by 1 m/s^2 and 2 rad/s^2 within the filter's 4 ms displays a mass of 2 kg.
     fast, slower = 9.0 * along, 9.0 * along - 4e-3 * np.repeat([1.0, 2.0], 3) * along
     np.testing.assert_allclose(left(fast, slower), [2.0, 1.0], rtol=1e-5)
 

@@ -31,11 +31,11 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 
 TIMEOUT = 0.1
-LEDGERS = ("wave", "tdpa")  # what leaves an end is paid for by what has come, to the last joule
+LEDGERS = ("wave", "tdpa")  # all output energy has been received before
 
 
 def silent(tmp_path, spans: list[tuple[float, float]], delay: float = 0.01) -> NetworkConfig:
-    """A network that delivers nothing in the spans [s]."""
+    """Return a network that delivers no packets in the spans [s]."""
     rows = ["time,delay", f"0,{delay}"]
     for start, stop in spans:
         rows += [f"{start},", f"{stop},{delay}"]
@@ -50,8 +50,8 @@ def run(network: NetworkConfig, method: str, model: OneDof):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, method):
-    """The wall is held from 6.5 to 11.5 s; nothing arrives from 8 to 9 s."""
+def test_wrench_has_no_step_at_a_silence_in_contact(tmp_path, method):
+    """The hand presses from 6.5 to 11.5 s; no packet arrives from 8 to 9 s."""
     model = OneDof(wall_stiffness=1000.0)
     result = run(silent(tmp_path, [(8.0, 9.0)]), method, model)
     t, felt, command = result.t, result.hand_force, result.command_position
@@ -61,12 +61,12 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     # The command is at rest soon, and stays.
     at_rest = command[(t > entered + STOP_TIME_S + 0.01) & (t < 9.0)]
     assert np.ptp(at_rest) < 1e-12
-    # From the end of the silence on nothing steps.
+    # No signal has a step after the silence.
     resumed = (t > entered) & (t < 11.0)
     assert np.abs(np.diff(felt[resumed])).max() < 0.5
     assert np.abs(np.diff(command[resumed])).max() < 2e-3
-    # It is as it was before; but to push back a hand that went on in the silence takes energy, and
-    # methods with an exact ledger have none that was not paid for: there the wall is pressed less.
+    # The state is as before, but pushing back a hand that moved on during the silence requires
+    # energy. Methods with an exact ledger have only the received energy, and press the wall less.
     again = (t > 9.0 + RESUME_TIME_S + 1.0) & (t < 11.4)
     tolerance = 0.15 if method in LEDGERS else 0.05
     assert felt[again].mean() == pytest.approx(felt[(t > 7.5) & (t < 8.0)].mean(), rel=tolerance)
@@ -75,10 +75,10 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "tdpa"])
-def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
+def test_second_press_is_independent_of_an_earlier_silence(tmp_path, method):
     """The wall is pressed twice; the first time there is silence in the middle.
 
-    Not so with TDPA: how hard its slave presses depends on all that its ledgers have seen.
+    TDPA is excluded: the force of its slave depends on the whole history of its ledgers.
     """
     model = OneDof(wall_stiffness=1000.0)
     task = Task()
@@ -101,31 +101,31 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_motion_during_silence_is_not_replayed(tmp_path, method):
-    """The hand swings from 0.5 to 3 s; nothing arrives from 1 to 2.5 s, while it swings."""
+    """The hand swings from 0.5 to 3 s; no packet arrives from 1 to 2.5 s."""
     result = run(silent(tmp_path, [(1.0, 2.5)]), method, OneDof())
     t = result.t
-    # Never faster than the hand itself and the way that was missed, on the ramp of the resumption,
-    # whose steepest rate is 15/8.
+    # The speed is at most that of the hand plus that of the missed displacement on the ramp of the
+    # resumption, whose steepest rate is 15/8.
     missed = np.ptp(result.master_position)
     fast = np.abs(np.diff(result.master_position)).max() + 15 / 8 * missed / RESUME_TIME_S * PERIOD
     back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME_S))[:-1]
     assert np.abs(np.diff(result.slave_position))[back].max() < fast
-    if not METHODS[method].balance_at_motors:  # there the command is a pull, written as a pose
+    if not METHODS[method].balance_at_motors:  # there the command is a force, written as a pose
         assert np.abs(np.diff(result.command_position))[back].max() < fast
     assert np.abs(np.diff(result.command_position)).max() < 5e-3
 
 
-def rough(path: Path, rng: np.random.Generator, until: float = 9.0) -> NetworkConfig:
-    """A network of jitter, reordering, loss, bursts and silence up to a time [s], then a good one.
+def rough_network(path: Path, rng: np.random.Generator, until: float = 9.0) -> NetworkConfig:
+    """Return a network of jitter, reordering, loss, bursts and silence up to a time [s].
 
-    It travels by a recorded trace of every millisecond.
+    Its delays are a recorded trace at 1 ms.
     """
     steps = round(until / PERIOD)
     mean, jitter = rng.uniform(0.0, 0.15), rng.uniform()
     delay = mean * (1.0 + jitter * rng.uniform(-1.0, 1.0, steps))
     lost = rng.uniform(size=steps) < rng.uniform(0.0, 0.5)
     start = 0.0
-    while start < until:  # bursts, some of them longer than the watchdog's patience
+    while start < until:  # some bursts exceed the watchdog's time-out
         stop = start + rng.exponential(0.15)
         burst = slice(round(start / PERIOD), round(stop / PERIOD))
         lost[burst] |= rng.uniform(size=len(lost[burst])) < rng.uniform(0.5, 1.0)
@@ -140,9 +140,9 @@ def rough(path: Path, rng: np.random.Generator, until: float = 9.0) -> NetworkCo
 
 @pytest.fixture(scope="module")
 def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]]:
-    """Pairs of directions."""
+    """Return a strategy for pairs of directions."""
     rng, folder = np.random.default_rng(5), tmp_path_factory.mktemp("rough")
-    lines = [rough(folder / f"{i}.csv", rng) for i in range(10)]
+    lines = [rough_network(folder / f"{i}.csv", rng) for i in range(10)]
     return list(zip(lines[::2], lines[1::2], strict=True))
 
 
@@ -150,7 +150,7 @@ def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_station_recovers_after_every_rough_network(rough_networks, method):
-    """With contact and any network until 9 s, the slave comes to rest at the hand."""
+    """The slave comes to rest at the hand in contact after any network until 9 s."""
     model = OneDof(wall_stiffness=500.0)
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method, force_limit=5.0)
@@ -167,7 +167,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
-    """In the 0.5 s after a silence, with the paper's wall, where several methods chatter."""
+    """The wrench is that of 0.5 s after a silence at the paper's wall, where methods chatter."""
     resumptions = 0
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method)

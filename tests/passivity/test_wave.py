@@ -26,11 +26,11 @@ T, STEPS = 1e-3, 1200
 
 
 def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
-    """Wrench at the hand and motion of the slave's command (x alone), both (N,).
+    """Return the wrench at the hand and the motion of the slave's command (x alone), both (N,).
 
     `contact(u, x)` is the force of the slave's end [N], for the wave u that arrives there and the
-    command x of the last step; packets travel for `forward` and `backward` steps. At the steps
-    `missing` none comes to the hand; for the first `fills` the slave's command stays.
+    command x of the last step; packets travel for `forward` and `backward` steps. No packet arrives
+    at the hand at steps `missing`; the slave's command is constant for the first `fills` steps.
     """
     p = method_parameters(
         PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config)
@@ -70,7 +70,7 @@ def motion():
 
 @pytest.mark.parametrize("delay", [1, 30, 500])
 @pytest.mark.parametrize("end", ["matched", "free", "rigid"])
-def test_closed_forms_of_the_line(motion, end, delay):
+def test_line_equals_its_closed_forms(motion, end, delay):
     """Z = b matched, b tanh(s T) free, b coth(s T) rigid: as exact recursions over the RTT."""
     b, n = 10.0, 2 * delay
     contact = {
@@ -101,7 +101,7 @@ def test_steady_position_error_is_the_momentum_on_the_line(delay):
 
 
 @pytest.mark.parametrize("delay", [1, 40])
-def test_a_line_that_filled_in_contact_holds_it(delay):
+def test_line_filled_in_contact_keeps_the_contact_force(delay):
     """5 N act before the line starts: the command stays, and 5 N are rendered."""
     f, x = line(WaveConfig(), np.zeros(400), lambda u, x: -5.0, delay, delay, fills=2 * delay + 100)
     assert np.abs(x).max() < 1e-12
@@ -110,8 +110,8 @@ def test_a_line_that_filled_in_contact_holds_it(delay):
 
 @pytest.mark.parametrize("delay", [1, 40, 300])
 def test_line_that_filled_in_contact_releases_only_its_energy(delay):
-    """f^2 (T + filter) / 2 b for a round trip of 2 T: to a wall that is matched, and a hand that
-    gives way as fast as takes the most from it."""
+    """The energy is f^2 (T + filter) / 2 b for a round trip of 2 T, a matched wall and a hand
+    whose speed extracts the most."""
     config, force, begin, steps = WaveConfig(), 5.0, 2 * delay + 100, 3 * delay + 300
     b = config.impedance[0]
     given = []
@@ -159,7 +159,7 @@ def test_energy_that_fills_a_line_counts_once():
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
 def test_wrench_rate_is_bounded_after_missing_packets(missing):
-    """In contact with a moving hand: at most 450 N/s instead of 1 to 7 N in a step."""
+    """A moving hand in contact receives at most 450 N/s instead of 1 to 7 N in a step."""
     pressed, begin = 0.01 * (1.0 - np.cos(np.arange(600) * T / 0.15)), 150
     f, _ = line(
         WaveConfig(),

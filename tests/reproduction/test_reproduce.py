@@ -124,7 +124,7 @@ def test_load_is_identified_from_sensor_samples(run):
 
 @pytest.mark.slow
 def test_the_speed_was_measured(run):
-    """Without bound: tests do not measure time."""
+    """The time has no bound, because tests do not measure time."""
     speed = run[0]["speed"]
     assert speed["real_time_factor"] > 0
     assert speed["cost_over_bare_plant"] > 1

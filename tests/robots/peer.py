@@ -15,10 +15,10 @@ import time
 
 DT = 0.002
 FLAWS = ("good", "lost", "twice", "swapped", "nan", "short", "saturated", "silent", "late", "good")
-SEEN = ("good", "lost", "nans", "silent", "old", "good")  # by who looks now and then
+SEEN = ("good", "lost", "nans", "silent", "old", "good")  # clients that rarely read
 TWO = ("good", "good")
 LONG = 20
-EACH = 6  # samples of a chapter; what is wrong stands in its middle
+EACH = 6  # samples of a chapter; the fault is in its middle
 SILENCE_S = 0.09
 SATURATED = 1  # of the flags in a UDP packet
 
@@ -36,12 +36,12 @@ def chapters(flaws=FLAWS):
             rows.insert(middle, (0.0, *rows[middle - 1][1:]))
         elif flaw == "swapped":
             rows[middle], rows[middle - 1] = rows[middle - 1], rows[middle]
-        elif flaw == "silent":  # and the clock goes on meanwhile
+        elif flaw == "silent":  # the clock continues
             rows[middle] = (SILENCE_S, *rows[middle][1:])
             gone = round(SILENCE_S / DT)
             rows = rows[:middle] + [(wait, n + gone, f) for wait, n, f in rows[middle:]]
             number += gone
-        elif flaw == "late":  # what was taken long ago comes now
+        elif flaw == "late":  # earlier samples arrive now
             rows[middle] = (0.0, number - EACH - 60, "")
         elif flaw == "old":
             rows = [(DT, number - 40 + k, "") for k in range(LONG)]
@@ -54,7 +54,7 @@ def chapters(flaws=FLAWS):
         yield from rows
 
 
-def play(send, flaws=FLAWS):
+def send_in_real_time(send, flaws=FLAWS):
     """Call send(number, flaw) in real time."""
     due = time.monotonic()
     for wait, number, flaw in chapters(flaws):
@@ -74,14 +74,14 @@ def netft():
     box.settimeout(5.0)
     print(box.getsockname()[1], flush=True)
 
-    def asked():
+    def wait_for_request():
         while True:
             packet, there = box.recvfrom(16)
             if struct.unpack(">HHI", packet) == (0x1234, 2, 0):
                 return there
 
     for flaws in (FLAWS, ("good",) * 3):
-        there = asked()
+        there = wait_for_request()
 
         def send(number, flaw, there=there):
             counts = [round(1000 * x) for x in wrench(number)]
@@ -89,9 +89,9 @@ def netft():
             record = struct.pack(">III6i", number, 7 * number, status, *counts)
             box.sendto(record[: 20 if flaw == "short" else 36], there)
 
-        play(send, flaws)
+        send_in_real_time(send, flaws)
         box.setblocking(False)
-        with contextlib.suppress(BlockingIOError):  # what was asked meanwhile, as nothing came
+        with contextlib.suppress(BlockingIOError):  # requests during the silence
             while True:
                 box.recv(16)
         box.settimeout(5.0)
@@ -120,23 +120,23 @@ def rtde(host, table=""):
             robot, _ = door.accept()
         robot.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-        def say(kind, content, robot=robot):
+        def send_message(kind, content, robot=robot):
             robot.sendall(struct.pack(">HB", 3 + len(content), ord(kind)) + content)
 
         names = []
-        asked = robot.makefile("rb")
-        while (head := asked.read(3))[2:] != b"S":
-            kind, content = chr(head[2]), asked.read(int.from_bytes(head[:2], "big") - 3)
+        wait_for_request = robot.makefile("rb")
+        while (head := wait_for_request.read(3))[2:] != b"S":
+            kind, content = chr(head[2]), wait_for_request.read(int.from_bytes(head[:2], "big") - 3)
             if kind == "V":
-                say(kind, b"\x01")
+                send_message(kind, b"\x01")
             elif kind == "v":
-                say(kind, struct.pack(">4I", 5, 12, 0, 0))
+                send_message(kind, struct.pack(">4I", 5, 12, 0, 0))
             elif kind == "O":
                 names = [name for name in content[8:].decode().split(",") if name]
-                say(kind, b"\x01" + ",".join(types[name] for name in names).encode())
-        say("S", b"\x01")
+                send_message(kind, b"\x01" + ",".join(types[name] for name in names).encode())
+        send_message("S", b"\x01")
 
-        def send(number, flaw, start=start, say=say, names=names):
+        def send(number, flaw, start=start, send_message=send_message, names=names):
             values = {
                 "timestamp": (start + DT * number,),
                 "ft_raw_wrench": wrench(number) if flaw != "nan" else (float("nan"),) * 6,
@@ -147,11 +147,11 @@ def rtde(host, table=""):
                 values["ft_raw_wrench"] = rows[number][:6]
                 values["actual_TCP_pose"] = rows[number][6:]
             numbers = [x for name in names for x in values[name]]
-            say("U", b"\x01" + struct.pack(f">{len(numbers)}d", *numbers))
+            send_message("U", b"\x01" + struct.pack(f">{len(numbers)}d", *numbers))
 
-        play(send, flaws)
+        send_in_real_time(send, flaws)
         robot.close()
-        asked.close()
+        wait_for_request.close()
         time.sleep(0.06)
 
 
@@ -166,7 +166,7 @@ def router(port):
 
 
 def ros(port):
-    """ROS 2 driver behind a router: it restarts, and then its clock is set.
+    """ROS 2 driver behind a router; it restarts, and then its clock is set.
 
     CDR, attachment and key are written explicitly.
     """
@@ -187,7 +187,7 @@ def ros(port):
                 attached = struct.pack("<qqB16s", number + first, ns, 16, b"x" * 16)
                 publisher.put(message[: 20 if flaw == "short" else 76], attachment=attached)
 
-            play(send, flaws)
+            send_in_real_time(send, flaws)
 
 
 def udp(port):
@@ -204,7 +204,7 @@ def udp(port):
                 packet = struct.pack("<4sIQd15d", b"DTW1", flags, number + first, t, *values)
                 sender.sendto(packet[: 20 if flaw == "short" else 144], ("127.0.0.1", int(port)))
 
-            play(send, flaws)
+            send_in_real_time(send, flaws)
 
 
 def joint_state(ns, names, positions):

@@ -51,11 +51,11 @@ def pose_message(t, values):
 def wait_for(publisher):
     while publisher.get_subscription_count() == 0:
         time.sleep(0.01)
-    time.sleep(1.0)  # until the other side knows, too
+    time.sleep(1.0)  # until the other side has connected
 
 
 def faults(domain):
-    """A tool at rest whose wrench is its number: invalid messages, silence, clock and restart."""
+    """Publish wrenches of a tool at rest: invalid messages, silence, clock, restart."""
     node = node_in(domain)
     publisher = node.create_publisher(WrenchStamped, "/ft/wrench", qos_profile_sensor_data)
     print("ready", flush=True)
@@ -86,13 +86,13 @@ def faults(domain):
     for flaw in ("nan", "short", "huge", "saturated"):
         play(1, flaw=flaw)
         play(20)
-    play(1, shift=-6 * DT)  # older than the one before
+    play(1, shift=-6 * DT)  # older than the previous one
     play(60)
     for _ in range(100):  # silence
         next(numbers)
     play(60)
-    play(400, shift=50.0)  # a clock that was set
-    # Another node of the same topic: its numbers begin again.
+    play(400, shift=50.0)  # a clock is set
+    # Another node of the same topic: its numbers restart.
     node.destroy_publisher(publisher)
     publisher = node.create_publisher(WrenchStamped, "/ft/wrench", qos_profile_sensor_data)
     wait_for(publisher)
@@ -145,8 +145,8 @@ def moving(domain, table, hz):
         wrenches.publish(wrench_message(t, row[:6]))
 
 
-def calls(domain):
-    """Call services and set parameters of /drake_teleop as the lines on stdin say."""
+def run_calls(domain):
+    """Call services and set parameters of /drake_teleop as requested by lines on stdin."""
     node = node_in(domain)
     parameters = AsyncParameterClient(node, "/drake_teleop")
     for line in sys.stdin:
@@ -171,5 +171,5 @@ def calls(domain):
 
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        PEERS = {"faults": faults, "echo": echo, "moving": moving, "calls": calls}
+        PEERS = {"faults": faults, "echo": echo, "moving": moving, "calls": run_calls}
         PEERS[sys.argv[1]](*sys.argv[2:])

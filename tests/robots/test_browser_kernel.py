@@ -1,4 +1,4 @@
-"""The kernel as WebAssembly, in node and in the page of the site: the numbers of `eliminate`."""
+"""Kernel as WebAssembly, in node and in the page of the site, compared with `eliminate`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = [
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="there is no node here")
-def test_bits_of_compensate_in_node(tmp_path):
+def test_kernel_in_node_has_the_bits_of_compensate(tmp_path):
     rows = kernel.readings(5000, seed=9)
     kernel.prepared(tmp_path, rows)
     found, _, size = kernel.in_node(tmp_path)
@@ -41,7 +41,7 @@ def test_bits_of_compensate_in_node(tmp_path):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """A page with the elements of browser.md, and its scripts."""
+    """Return a page with the elements of browser.md, and its scripts."""
     folder = tmp_path_factory.mktemp("site")
     text = (ROOT / "docs" / "browser.md").read_text(encoding="utf-8")
     (body,) = re.findall(r"```\{raw\} html\n(.*?)```", text, re.S)

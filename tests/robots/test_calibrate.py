@@ -1,4 +1,4 @@
-"""Calibration from a stream: parameters are known when they are, and not before."""
+"""Calibration from a stream: parameters are reported only when they are determined."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TOLERANCE = parse_tolerance("mass 0.5 %, com 0.5 mm")
 
 
 def motion(t: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotations about `axes` in turn, by 1 rad and back in one second each."""
+    """Return rotations about `axes` one after another, by 1 rad and back in one second each."""
     angle, k = 0.5 * (1.0 - np.cos(2 * np.pi * t)), np.floor(t).astype(int) % len(axes)
     e = np.eye(3)[axes[k]]
     speed, change = np.pi * np.sin(2 * np.pi * t), 2 * np.pi**2 * np.cos(2 * np.pi * t)
@@ -97,7 +97,7 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     assert last.record_length_s == pytest.approx(identify_log(path).log.t[-1])
 
 
-class Live(Stream):
+class FailingStream(Stream):
     """Live stream that ends with an error."""
 
     live = True
@@ -113,9 +113,9 @@ def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> 
     path = tmp_path / "log.parquet"
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-            calibrate(Live(recorded(seconds, [0])), Recorder(), path, TOLERANCE)
+            calibrate(FailingStream(recorded(seconds, [0])), Recorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(Live(recorded(0.0, [0])), Recorder(), path, TOLERANCE)  # nothing came
+        calibrate(FailingStream(recorded(0.0, [0])), Recorder(), path, TOLERANCE)  # no data
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
@@ -190,7 +190,7 @@ def test_command_reports_the_time_of_a_tare(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_advice_is_the_missing_motion(axis: int) -> None:
-    """At rest the advice is a rotation about a horizontal axis."""
+    """The advice at rest is a rotation about a horizontal axis."""
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
     errors = derivatives_over_tolerances(parse_tolerance("inertia 1 %"), PHI)
@@ -255,7 +255,7 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
         recorder.add(Reading(k, 1e7 if k == 400 else DT * k, wrench, stream=WRENCH, arrival=DT * k))
         recorder.add(Reading(k, 1e4 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
-    for k in range(100):  # both were set
+    for k in range(100):  # both clocks were set
         recorder.add(Reading(k, 70.0 + DT * k, wrench, stream=WRENCH, arrival=DT * k))
         recorder.add(Reading(k, 90.0 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1

@@ -46,7 +46,7 @@ def loaded(values: Values, phi: Values) -> Values:
     return non_contact_wrench(values[:, 6:9], values[:, 9:12], values[:, 12:], phi)
 
 
-class Readings:
+class ReadingSource:
     """Source that ends."""
 
     dt = DT
@@ -84,8 +84,8 @@ def compensated(
     sought = ChangeMonitor(DT, live=live, report=messages.append) if looked_for else None
     sink = ListSink()
     compensator = Compensator(LOAD, DT, watch=ContactAndLoadMonitor(LOAD, DT, 30.0))
-    # As fast as it comes: the clock of the loop is that of the readings.
-    compensate_stream(Readings(values, live=False), compensator, sink, changes=sought)
+    # As fast as possible: the clock of the loop is that of the readings.
+    compensate_stream(ReadingSource(values, live=False), compensator, sink, changes=sought)
     if sought is not None:
         sought.close()
     return sink.out, messages

@@ -72,7 +72,7 @@ class ListSink:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """2 s with a push, noise, a late motion, and a gap."""
+    """Return 2 s with a push, noise, a late motion, and a gap."""
     t = DT * np.arange(1000)
     rng = np.random.default_rng(3)
     wrench = non_contact_wrench(*moving(t), PHI) + OFFSETS + 0.1 * rng.normal(size=(1000, 6))
@@ -129,7 +129,7 @@ def test_separate_scales_need_gravity_in_the_readings() -> None:
         Compensator(replace(load(), weight_removed=True), DT, sigma_inertia=0.5)
 
 
-def bad(reading: Reading, name: str) -> Reading:
+def bad_reading(reading: Reading, name: str) -> Reading:
     values = reading.values.copy()
     if name == "damaged":
         return DAMAGED_READING
@@ -159,7 +159,7 @@ def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: ReadingFlag) -> 
     stream = readings(40, touched=5.0)
     for reading in stream[:20]:
         before = compensator.step(reading, reading.t)
-    wrong = compensator.step(bad(stream[20], name), stream[20].t)
+    wrong = compensator.step(bad_reading(stream[20], name), stream[20].t)
     assert wrong.flags & flag and not wrong.contact.any() and not wrong.scaled.any()
     assert math.isfinite(wrong.t)
     for reading in stream[21:]:

@@ -37,7 +37,7 @@ def status(arguments: list[str]) -> int:
 
 @pytest.fixture
 def exported(tmp_path, monkeypatch) -> Path:
-    """The folder that the command of docs/controller.md writes."""
+    """Return the folder that the command of docs/controller.md writes."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out" / "load").mkdir(parents=True)
     kernel.LOAD.save(tmp_path / "out" / "load" / "identification.json")
@@ -82,7 +82,7 @@ def test_the_vector_contains_each_flag(exported):
 
 @needs_cc
 @pytest.mark.slow
-def test_bits_of_compensate_and_size(tmp_path):
+def test_output_has_the_bits_of_compensate_within_the_size_limit(tmp_path):
     rows = kernel.readings(20_000, seed=3)
     kernel.prepared(tmp_path, rows)
     found, _, size = kernel.replayed(tmp_path, [CC, *CFLAGS, "-Os"], [])
@@ -202,7 +202,7 @@ def with_new_parameter(n):
 
 
 @pytest.mark.parametrize("function", [with_while, with_integer_division, with_new_parameter])
-def test_syntax_that_is_not_supported_is_named(function):
+def test_unsupported_syntax_is_named(function):
     with pytest.raises(ValueError, match=rf"^{function.__name__}: .*cannot be translated"):
         Translator().translate_function(function, n="int")
 

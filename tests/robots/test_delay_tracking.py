@@ -77,7 +77,7 @@ def test_delay_is_at_most_100_ms(side: float) -> None:
     assert follower.delay_s == side * 0.1
 
 
-def test_contact_is_excluded_and_another_clock_restarts_the_tracking() -> None:
+def test_contact_is_excluded_and_a_new_clock_restarts_the_tracking() -> None:
     follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     followed(follower, 0.0, 1.0, 0.005)
     followed(follower, 1.0, 2.0, 0.005, push=5.0)

@@ -50,7 +50,7 @@ def in_flange() -> tuple[np.ndarray, np.ndarray]:
 
 
 Values = tuple[float, np.ndarray, np.ndarray | None]
-"""What a format says of mass, centre of mass, and inertia about it, if it takes one."""
+"""Mass, centre of mass, and inertia about it, if the format contains one."""
 
 
 def tensor(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> np.ndarray:
@@ -171,7 +171,7 @@ def test_exported_compensation_cancels_the_reading(sign):
     tools = yaml.safe_load(export_load(FOUND, "ft_tools", sign=sign)[0])
     offset = np.array([*tools["force_offset"], *tools["torque_offset"]])
     weight = tools["mass"] * g
-    # As ft_tools has it: the load pulls at the sensor.
+    # ft_tools uses the wrench of the load on the sensor.
     left = (
         reading - offset - np.concatenate([weight, np.cross(tools["sensor_frame_to_com"], weight)])
     )

@@ -100,7 +100,7 @@ def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
     assert messages.readings_of_cdr(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
 
 
-class Joints(StreamStub):
+class JointSource(StreamStub):
     """Source of given parts."""
 
     def __init__(self, parts: list[Reading]) -> None:
@@ -117,7 +117,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     t, *joints = moved(0.4)
     bad = Reading(0, 0.0, np.zeros(7), stream=POSE), Reading(0, 0.0, np.full(3, 0.1), stream=JOINTS)
     parts = [Reading(k, float(t[k]), q, stream=JOINTS) for k, q in enumerate(joints[0])]
-    source = PoseSourceFromJoints(Joints([*bad, *parts]), arm)
+    source = PoseSourceFromJoints(JointSource([*bad, *parts]), arm)
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()

@@ -45,7 +45,7 @@ from drake_teleop.robots.udp import UdpSource
 
 PEER = Path(__file__).with_name("peer.py")
 AT_REST = np.array([0.0, 0.0, 9.81, *np.zeros(6)])
-ADDRESS = f"127.{os.getpid() // 250 % 250}.{os.getpid() % 250}.7"  # ur_rtde has but one port
+ADDRESS = f"127.{os.getpid() // 250 % 250}.{os.getpid() % 250}.7"  # ur_rtde has only one port
 LOST = {9, 10, 11}
 OFFSETS = np.array([0.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
@@ -62,7 +62,7 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
             process.kill()
 
 
-class Seen(list[CompensatedWrench]):
+class LoopOutputs(list[CompensatedWrench]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(
@@ -102,7 +102,7 @@ class Seen(list[CompensatedWrench]):
         return out
 
     def check(self, flags: ReadingFlag) -> None:
-        """The story of the peer: named, zero, and good again by itself."""
+        """Check that faults are flagged with zero output, and that good outputs follow."""
         assert np.isfinite([[*row.contact, *row.scaled, row.t] for row in self]).all()
         assert not any(row.contact.any() or row.scaled.any() for row in self if row.flags)
         named = ReadingFlag(0)
@@ -126,11 +126,11 @@ def free_port() -> str:
         return str(free.getsockname()[1])
 
 
-def test_udp() -> None:
+def test_udp_faults_are_flagged() -> None:
     source = UdpSource("udp://:0", 0.002)
-    Compensator(load(), source.dt)  # loads what is compiled: the sender waits for nobody
+    Compensator(load(), source.dt)  # loads compiled functions: the sender does not wait
     with peer("udp", str(source.port)):
-        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
+        seen = LoopOutputs(source, 510, ReadingFlag.CLOCK_JUMP)
     source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -141,13 +141,13 @@ def test_udp() -> None:
     )
     seen.check(flags | ReadingFlag.RESTART | ReadingFlag.CLOCK_JUMP)
     numbers = [row.number for row in seen]
-    assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
+    assert numbers[numbers.index(12) - 1] == 8  # and no data instead of the lost packets
 
 
-def test_netft() -> None:
+def test_netft_faults_are_flagged() -> None:
     with peer("netft") as (port, _):
         source = NetFtSource(f"netft://127.0.0.1:{port}?counts=1000,1000&sign=1", 0.002)
-        seen = Seen(source, 10)
+        seen = LoopOutputs(source, 10)
         source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -158,15 +158,15 @@ def test_netft() -> None:
     )
     seen.check(flags)
     numbers = [row.number for row in seen]
-    assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
+    assert numbers[numbers.index(12) - 1] == 8  # and no data instead of the lost packets
 
 
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
-def test_rtde() -> None:
+def test_rtde_faults_are_flagged() -> None:
     sockets.on_purpose.add(30004)  # of this machine, but not 127.0.0.1
     with peer("rtde", ADDRESS) as (host, _):
         source = RtdeSource(f"rtde://{host}?sign=1")
-        seen = Seen(source, 510)
+        seen = LoopOutputs(source, 510)
         source.close()
     assert source.dt == 0.002
     seen.check(
@@ -182,10 +182,10 @@ def test_rtde() -> None:
     ]
 
 
-def test_ros_2() -> None:
+def test_ros_2_faults_are_flagged() -> None:
     with peer("ros", free_port()) as (port, _):
         source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
-        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
+        seen = LoopOutputs(source, 510, ReadingFlag.CLOCK_JUMP)
         source.close()
     flags = (
         ReadingFlag.REORDERED
@@ -240,7 +240,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
         page.send(json.dumps(asked))
         for row in rows:
             file.write(row)
-        while True:  # the subscription is answered by nothing
+        while True:  # no node answers the subscription
             live.write(rows[2])
             with contextlib.suppress(TimeoutError):
                 shown = page.recv(timeout=0.01)
@@ -257,7 +257,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])
-def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: bool) -> None:
+def test_netft_with_another_rate_has_only_the_rate_flag(real_hz: float, named: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=1,1&rate=1000&sign=1")
     compensator, flags = Compensator(load(), source.dt), []
     for k in range(round(2.5 * real_hz)):
@@ -276,9 +276,7 @@ def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: 
      (1 << 31 | 1, ReadingFlag.DAMAGED),
      (1 << 17, ReadingFlag.SATURATED), (1 << 31 | 1 << 17, ReadingFlag.SATURATED)],
 )  # fmt: skip
-def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
-    status: int, flag: int, still: bool
-) -> None:
+def test_netft_status_and_repeated_samples_are_flagged(status: int, flag: int, still: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
     counts = [2, -4, 6, 4, -8, 12]
     source.reading_of_packet(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)

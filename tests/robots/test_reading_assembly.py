@@ -117,7 +117,7 @@ def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
         open_source("udp://:0", weightless, rate_hz=500.0)
 
 
-def test_two_clocks() -> None:
+def test_motion_on_another_clock_is_synchronised() -> None:
     apart = ReadingAssembler(ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
     same = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
@@ -153,7 +153,7 @@ def test_invalid_and_out_of_order_poses_are_ignored() -> None:
         for k in range(300, 400)
         for each in assembly.readings_completed_by(wrench_at(k * DT, k)._replace(arrival=k * DT))
     ]
-    assert after == []  # as no more motions are known
+    assert after == []  # unknown motion
 
 
 def test_assembly_accepts_a_clock_that_is_set_back() -> None:

@@ -26,8 +26,8 @@ TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch) -> Iterator[None]:
-    """Folder with the result of `identify`; one test at a time, because the ports are fixed."""
+def in_folder(tmp_path, monkeypatch) -> Iterator[None]:
+    """Change to a folder with the result of `identify`; a lock serialises tests on these ports."""
     monkeypatch.chdir(tmp_path)
     Path("out/load").mkdir(parents=True)
     load().save(Path("out/load/identification.json"))
@@ -37,7 +37,7 @@ def here(tmp_path, monkeypatch) -> Iterator[None]:
 
 
 class Peer:
-    """Sender of packets to port 49152, one every `each_s`, from when it is open.
+    """Sender of packets to port 49152, one every `each_s`, as soon as it is open.
 
     With a socket of answers the packets start after the first answer, and end with Ctrl-C. The
     first packet contains no reading, because a late one would shift the clock for good.
@@ -63,7 +63,7 @@ class Peer:
             while not self._over.wait(0.02) and not self._listens(sender):
                 pass
             due = time.monotonic()
-            with contextlib.suppress(ConnectionRefusedError):  # it is known before all is sent
+            with contextlib.suppress(ConnectionRefusedError):  # identified before the end
                 for packet in self._packets:
                     due += self._each_s
                     if self._over.wait(max(0.0, due - time.monotonic())):
@@ -79,7 +79,7 @@ class Peer:
             sender.connect(("127.0.0.1", 49152))
             sender.send(b"is anybody there?")
             time.sleep(0.02)
-            sender.send(b"")  # this machine says now that nobody took the first
+            sender.send(b"")  # the socket reports that the first packet was not received
         except ConnectionRefusedError:
             return False
         self._hear()
@@ -93,8 +93,8 @@ class Peer:
 
 
 @pytest.fixture
-def answers(here) -> Iterator[socket.socket]:
-    """Receiver of the wrenches."""
+def answers(in_folder) -> Iterator[socket.socket]:
+    """Return a receiver of the wrenches."""
     with udp.open_udp_receiver(udp.LOCALHOST, 49153) as there:
         there.setblocking(False)
         yield there
@@ -107,7 +107,7 @@ def touched(count: int) -> list[Reading]:
 
 
 @pytest.mark.long
-def test_documented_calibrate_command_identifies_the_load(here) -> None:
+def test_documented_calibrate_command_identifies_the_load(in_folder) -> None:
     rows = recorded(40.0, [0, 1, 2])
     packets = [udp.pack_reading(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
     with Peer(packets, 0.1 * DT):
@@ -119,7 +119,7 @@ def test_documented_calibrate_command_identifies_the_load(here) -> None:
 
 
 @pytest.mark.long
-def test_documented_compensate_command_eliminates_the_tool(here, answers, capfd) -> None:
+def test_documented_compensate_command_eliminates_the_tool(in_folder, answers, capfd) -> None:
     with Peer([udp.pack_reading(row) for row in touched(800)], 0.001, answers) as peer:
         type_in("docs/robot.md", "drake-teleop compensate udp")
     assert "tare" in capfd.readouterr().err
@@ -128,7 +128,7 @@ def test_documented_compensate_command_eliminates_the_tool(here, answers, capfd)
     np.testing.assert_allclose(last.contact, TOUCH, atol=0.01)
 
 
-def test_documented_compensate_command_works_with_poses(here, answers) -> None:
+def test_documented_compensate_command_works_with_poses(in_folder, answers) -> None:
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.1, 0.3])
     packets = [
         udp.pack_wrench_and_pose(

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from peer import HASH
 from test_compensator import PHI, load
-from test_peers import Seen
+from test_peers import LoopOutputs
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
@@ -46,7 +46,7 @@ def process(*words: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
 
 
 class Echo(list[dict[str, Any]]):
-    """Lines of a peer's node, as they arrive."""
+    """Lines of a peer's node in the order of arrival."""
 
     def __init__(self, started: subprocess.Popen[str]) -> None:
         self._thread = threading.Thread(target=self._read, args=(started,), daemon=True)
@@ -106,7 +106,7 @@ def test_faults_of_a_node_are_named_and_zero() -> None:
     with process(str(PEER), "faults", DOMAIN) as peer:
         assert peer.stdout is not None and peer.stdout.readline() == "ready\n"
         source = Ros2Source(f"ros2://ft/wrench?domain={DOMAIN}&sign=1", 0.002)
-        seen = Seen(source, 20, ReadingFlag.RESTART, 60.0)
+        seen = LoopOutputs(source, 20, ReadingFlag.RESTART, 60.0)
         source.close()
     flags = (
         ReadingFlag.REORDERED

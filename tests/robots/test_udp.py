@@ -235,7 +235,7 @@ def test_table_contains_the_rows_before_a_kill(tmp_path: Path, name: str, after:
     assert len(rows) >= last - 60  # of which 1000 come in a second
 
 
-class Failing:
+class FailingSink:
     """Sink that is used until the disk is full, or until an error or Ctrl-C."""
 
     def __init__(self, sink: lines.TableSink) -> None:
@@ -253,7 +253,7 @@ class Failing:
 def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
     monkeypatch.setattr(lines, "TABLE_WRITE_PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
-        failing = Failing(lines.TableSink(tmp_path / name))
+        failing = FailingSink(lines.TableSink(tmp_path / name))
         failing.write_until(CannotWrite)
         with pytest.raises(CannotWrite):
             failing.sink.close()
@@ -265,8 +265,8 @@ def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
 def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error) -> None:
-    """This includes an interrupt while rows are written."""
-    failing, path = Failing(lines.TableSink(tmp_path / name)), tmp_path / name
+    """Interrupts may occur while rows are written."""
+    failing, path = FailingSink(lines.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lines.time, "monotonic", lambda: (_ for _ in ()).throw(error))
@@ -294,7 +294,7 @@ def test_live_source_keeps_earlier_files(tmp_path, name, monkeypatch) -> None:
         assert len(table_of(tmp_path / name)) == 30
 
 
-class Interrupted:
+class InterruptedSource:
     """Source with one reading, followed by Ctrl-C."""
 
     dt, live = DT, True
@@ -312,13 +312,13 @@ class Interrupted:
 
 
 def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert compensate_stream(Interrupted(), Compensator(load(), DT), open_sink("-")) == {
+    assert compensate_stream(InterruptedSource(), Compensator(load(), DT), open_sink("-")) == {
         "wrenches": 1
     }
     assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
-class SignalLost(Interrupted):
+class SignalLosingSource(InterruptedSource):
     """Source of which C code loses the KeyboardInterrupt of a signal."""
 
     def __init__(self, number: signal.Signals) -> None:
@@ -343,14 +343,14 @@ def handlers() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handlers")
 def test_loop_ends_at_a_signal_whose_exception_is_lost() -> None:
-    source = SignalLost(signal.SIGTERM)
+    source = SignalLosingSource(signal.SIGTERM)
     assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
 
 
 def test_loop_of_a_program_ends_at_ctrl_c_whose_exception_is_lost() -> None:
     with hearing_ctrl_c():
         for _ in range(2):
-            source = SignalLost(signal.SIGINT)
+            source = SignalLosingSource(signal.SIGINT)
             assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {
                 "wrenches": 1
             }
@@ -374,7 +374,7 @@ def test_delayed_signals_are_handled_at_the_end(number: signal.Signals) -> None:
 
 def test_control_port_answers_tare_requests() -> None:
     control = TareRequestPort(0)
-    control.answer_request(lambda: "")  # nothing was asked
+    control.answer_request(lambda: "")  # no request
     with udp.open_udp_receiver(udp.LOCALHOST, 0) as asker:
         asker.settimeout(5.0)
         for word in (b"tare\n", b"tear"):

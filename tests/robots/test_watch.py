@@ -62,7 +62,7 @@ def test_push_is_flagged_while_it_lasts() -> None:
 
 @pytest.mark.long
 def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> None:
-    """With gains wrong by 5 % the threshold is a third of that of the watch."""
+    """The threshold is a third of that of the watch with gain errors of 5 %."""
     gains, free = np.array([1.05, 1.0, 0.95, 1.0, 1.05, 1.0]), tmp_path / "free.parquet"
     t, before = readings(seed=5)
     before[:, :6] *= gains
@@ -106,7 +106,7 @@ def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
     _, values = shaken(seed=2)
     start = np.split(values[:250, 6:], 3, axis=1)
     tared = (values[:250, :6] - non_contact_wrench(*start, PHI)).mean(axis=0)
-    # At the centre of mass, as inertia acts: no other channel betrays it.
+    # At the centre of mass, like inertia: no other channel contains the contact.
     values[500:750, :6] += 0.35 * np.array([1.0, 0.0, 0.0, 0.0, 0.06, 0.02])
     compensator = Compensator(LOAD, DT, detector=StreamContactDetector(LOAD, free, DT, 30.0, 0.0))
     compensator.offsets = tared

@@ -24,9 +24,9 @@ def arm():
 def outputs(
     config: ForceScalingConfig, arm, contact=(0.0,) * 6, scales: dict[str, float] | None = None
 ) -> dict[str, np.ndarray]:
-    """The block's outputs for one sample of a load that moves and touches something.
+    """Return the block's outputs for one sample of a load that moves in contact.
 
-    With `scales`, after these were set while it runs.
+    Given `scales` are set while it runs.
     """
     rng = np.random.default_rng(3)
     motion, offsets = rng.normal(size=(3, 3)) * 5, rng.normal(size=6)
@@ -49,7 +49,7 @@ def outputs(
     return found
 
 
-def test_the_four_cases_of_section_v(arm):
+def test_four_cases_of_section_v_have_their_wrenches(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     for sigma in (0.0, 0.5, 1.0, 2.0):
         out = outputs(ForceScalingConfig(sigma=sigma), arm, contact)
@@ -58,7 +58,7 @@ def test_the_four_cases_of_section_v(arm):
         np.testing.assert_allclose(out["scaled_wrench_S"], expected, atol=1e-12)
 
 
-def test_gamma_scales_the_contact_alone(arm):
+def test_gamma_scales_only_the_contact(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     out = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
     np.testing.assert_allclose(out["scaled_wrench_S"], 3 * contact, atol=1e-12)
@@ -92,7 +92,7 @@ Q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 
 
 def weight_wrench(arm, phi) -> np.ndarray:
-    """The wrench V(-g) phi in the pose of `outputs`."""
+    """Return the wrench V(-g) phi in the pose of `outputs`."""
     gravity = np.empty(3)
     sensor_acceleration_into(arm.table, Q, np.zeros(3), gravity)
     assert np.linalg.norm(gravity) == pytest.approx(9.81, rel=1e-3)
@@ -128,7 +128,7 @@ def test_rendered_wrench_is_the_scaled_reaction(arm):
     assert np.linalg.norm(force_B) == pytest.approx(np.linalg.norm(force_S) / 17.5)
 
 
-def test_load_wrench_is_the_rest_beside_the_contact(arm):
+def test_load_wrench_is_the_output_minus_the_contact(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     touched = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
     assert not touched["load_wrench_B"].any()

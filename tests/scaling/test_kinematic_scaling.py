@@ -66,7 +66,7 @@ def test_quaternion_sign_does_not_matter(pose, master, command, translation, ang
     flip = np.array([-1.0] * 4 + [1.0] * 3)
     difference = rotation(pose) @ rotation(master).T
     if np.trace(difference) < -0.999:
-        return  # at 180 degrees the shorter way round is undecided
+        return  # at 180 degrees the shorter rotation is ambiguous
     for other in (
         scale_pose(flip * pose, master, command, translation=translation, angle=angle),
         scale_pose(pose, flip * master, command, translation=translation, angle=angle),
@@ -109,7 +109,7 @@ def test_commanded_quaternion_has_norm_one(pose, master, command):
 
 
 class HandAndClutch(LeafSystem):
-    """A moving master and a clutch that opens and closes."""
+    """Moving master, and a clutch that opens and closes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class HandAndClutch(LeafSystem):
 
 
 def commands(config, start, times) -> np.ndarray:
-    """The commanded poses at `times`, sampled at 1 kHz."""
+    """Return the commanded poses at `times`, sampled at 1 kHz."""
     builder = DiagramBuilder()
     source = builder.AddSystem(HandAndClutch())
     scaling = builder.AddSystem(KinematicScaling(config, 1e-3, start))
@@ -171,7 +171,7 @@ def test_clutch_holds_the_command_and_re_indexes_without_a_jump():
     np.testing.assert_allclose(path[1200, 4:] - start[4:], moved, atol=1e-12)
 
 
-def test_the_clutch_waits_for_a_pose():
+def test_clutch_requires_a_valid_pose():
     """An invalid pose would stay the reference."""
     system = KinematicScaling(KinematicScalingConfig(), 1e-3, np.arange(1.0, 8.0))
     context = system.CreateDefaultContext()

@@ -20,14 +20,14 @@ rotations = st.tuples(angles, angles, angles).map(
 )
 
 
-def test_hand_feels_the_weight_pull_down():
-    """At rest Eq. (1) gives f = -m g, here up along -z_S; the hand is pulled down by m g / 17.5."""
+def test_weight_pulls_the_hand_down():
+    """The wrench at rest is f = -m g, here up along -z_S; the hand is pulled down by m g / 17.5."""
     wrench_S = np.array([0, 0, -3.13 * 9.81, 0, 0, 0])
     felt = wrench_to_master(wrench_S, TOOL_DOWN, np.eye(3), 1 / 17.5, 1 / 17.5)
     np.testing.assert_allclose(felt, [0, 0, -3.13 * 9.81 / 17.5, 0, 0, 0], atol=1e-12)
 
 
-def test_hand_feels_the_reaction_of_a_torque_with_its_own_scale():
+def test_reaction_of_a_torque_has_its_own_scale():
     wrench_S = np.array([1.0, 0, 0, 0, 2.0, 0])
     felt = wrench_to_master(wrench_S, TOOL_DOWN, np.eye(3), 0.1, 0.5)
     np.testing.assert_allclose(felt, [-0.1, 0, 0, 0, 1.0, 0], atol=1e-15)
@@ -47,7 +47,7 @@ def test_compiled_sample_equals_the_vectorised_form(R_WS, R_WB, seed):
 
 @given(rotations, rotations, st.integers(0, 2**31), st.floats(0.1, 5))
 def test_equal_scales_of_motion_and_force_keep_the_power(R_WS, R_WB, seed, scale):
-    """The hand's power is what the slave's motion draws, motion from the kinematic scaling."""
+    """The power of the hand equals that of the slave's motion from the kinematic scaling."""
     rng = np.random.default_rng(seed)
     velocity_B, omega_B, wrench_S = rng.normal(size=3), rng.normal(size=3), rng.normal(size=6)
     alignment = RotationMatrix(R_WB).ToQuaternion().wxyz()

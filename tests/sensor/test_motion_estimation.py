@@ -49,7 +49,7 @@ T = 1 / 8000
 SOURCES = ("encoders", "accelerometer", "fused")
 ARM = AddSlavePlant(DiagramBuilder(), Slave(), None, np.zeros(6)).arm
 JR3 = PRESETS["jr3_85m35a3"]
-#: Nothing but its low-pass, and an accelerometer that is somewhere and looks somewhere else.
+#: Sensor with low-pass only, and an accelerometer at a wrong place and orientation.
 QUIET = dataclasses.replace(
     without_parts(JR3, "noise", "random_walk", "offset", "drift", "quantisation"),
     p_SoAo_S=[0.02, -0.03, 0.05],
@@ -57,7 +57,7 @@ QUIET = dataclasses.replace(
 )
 
 
-@functools.cache  # what it compiles is not for each worker to compile while it collects
+@functools.cache  # compilation in each worker during collection is avoided
 def home() -> Array:
     return home_posture(ARM, [0.55, 0.0, 0.45])
 
@@ -77,18 +77,18 @@ def sampled(
     truth: Array,
     sensor: WristSensorConfig,
     config: MotionEstimationConfig,
-    believed: WristSensorConfig | None = None,
+    nominal: WristSensorConfig | None = None,
     table: Array = ARM.table,
     seed: int = 0,
 ) -> Array:
-    """Return samples of sensor and estimation; `believed` is the nominal sensor."""
+    """Return samples of sensor and estimation; `nominal` is the nominal sensor."""
     n = truth.shape[1] - 15
     noise = np.random.default_rng(seed).standard_normal(
         (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE)
     )
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
     chain, chain_memory = initialize_sensor_chain(sensor, n, T)
-    constants, memory = initialize_motion_estimator(config, believed or sensor, n, T)
+    constants, memory = initialize_motion_estimator(config, nominal or sensor, n, T)
     for k in range(len(truth)):
         read_sensor_into(
             chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
@@ -141,7 +141,7 @@ def fast() -> Array:
 SETTLED = 8000
 
 
-# What comes out without errors of the sensor
+# Outputs without errors of the sensor
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_noiseless_sensor_gives_truth_of_one_earlier_instant(source, tolerance, 
 
 
 def test_noiseless_accelerometer_sample_is_moved_and_filtered(fast):
-    """At So, with the wrench's low-pass; omega is the slope of the filtered angles."""
+    """The sample is at So with the wrench's low-pass; omega is the slope of filtered angles."""
     sensor = dataclasses.replace(QUIET, p_SoAo_S=[0.0] * 3, R_SA=list(np.eye(3).ravel()))
     config = MotionEstimationConfig(source="accelerometer")
     samples = sampled(fast, sensor, config)
@@ -192,7 +192,7 @@ def test_an_ideal_sensor_is_not_corrected(source, fast):
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("joints", [2, 4, 7])
 def test_arms_with_other_numbers_of_joints(source, joints):
-    # A chain stays one if links at its base are left out, or repeated.
+    # Links at the base may be removed or repeated without breaking the chain.
     rows = np.r_[np.zeros(max(joints - 6, 0), int), np.arange(max(6 - joints, 0), 7)]
     arm = dataclasses.replace(ARM, table=ARM.table[rows])
     t = np.arange(6000) * T
@@ -209,7 +209,7 @@ def test_arms_with_other_numbers_of_joints(source, joints):
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("frequency", [5.0, 20.0])
 def test_wrench_and_motion_are_in_phase(source, preset, frequency):
-    """Within a fiftieth of a sample, and within a twentieth of the stated delay.
+    """The difference is within a fiftieth of a sample and a twentieth of the stated delay.
 
     Source `encoders` has a low-pass whose phase exceeds its delay by 0.1 samples at 5 Hz
     and 1.6 at 20 Hz.
@@ -241,7 +241,7 @@ def test_wrench_and_motion_are_in_phase(source, preset, frequency):
     assert np.abs(lateness[strong] - delay).max() < 0.05
 
 
-def test_the_delays_add_up():
+def test_total_delay_is_the_sum_of_delays():
     sensor = dataclasses.replace(
         JR3, force_latency=1e-3, acceleration_latency=3e-3, encoder_latency=2e-3
     )
@@ -264,8 +264,8 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
     config = MotionEstimationConfig("accelerometer")
     t = np.arange(12000) * T
 
-    def left(truth: Array, believed: WristSensorConfig) -> float:
-        return rms(eliminated(sampled(truth, late, config, believed)[SETTLED:])[:, :3])
+    def left(truth: Array, nominal: WristSensorConfig) -> float:
+        return rms(eliminated(sampled(truth, late, config, nominal)[SETTLED:])[:, :3])
 
     def inertial(truth: Array) -> float:
         """Return the residual after elimination of the weight only."""
@@ -290,7 +290,7 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
 @settings(max_examples=60)
 @example(-6.0, -2.0, 0.0, 1e-2)
 @given(st.floats(-7, -3), st.floats(-3, 1), st.floats(-4, 2), st.sampled_from([T, 1e-3, 1e-2]))
-def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period):
+def test_gains_equal_those_of_the_kalman_filter(position, acceleration, drift, period):
     position_std, white, walk = 10.0**position, 10.0**acceleration, 10.0**drift
     found = steady_state_kalman_gains(position_std, white, walk, period)
     # In samples and standard deviations of the position.
@@ -299,8 +299,8 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
     Q = np.outer(noise, noise)
     Q[2, 2] = (walk * period**2.5 / position_std) ** 2
     gains = found * [1, period, period**2]
-    # The gains are a fixed point of the Riccati equation: the covariance of the filter that has
-    # them, a linear equation, gives them back.
+    # The gains are a fixed point of the Riccati equation: they follow from the covariance of
+    # their own filter, a linear equation.
     A = (np.eye(3) - gains[:, None] * h) @ F
     N = (np.eye(3) - gains[:, None] * h) @ Q @ (np.eye(3) - gains[:, None] * h).T
     N += np.outer(gains, gains)
@@ -313,7 +313,7 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
 
 
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
-    """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
+    """White noise only: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
     gains = steady_state_kalman_gains(position_std, acceleration_std, 1e-3, T)
     crossover = np.sqrt(acceleration_std / position_std)
@@ -326,7 +326,7 @@ def test_filter_errors_equal_the_predicted_deviations():
     gains = steady_state_kalman_gains(position_std, white, walk, T)
     random = np.random.default_rng(1)
     error = np.cumsum(walk * np.sqrt(T) * random.standard_normal((steps, 3)), axis=0)
-    # True acceleration zero: what is measured is error and noise, and rate and angle stay zero.
+    # The true acceleration is zero: measurements are error and noise; rate and angle stay zero.
     measured = -error + white * random.standard_normal((steps, 3))
     angle = position_std * random.standard_normal((steps, 3))
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
@@ -348,7 +348,7 @@ def test_gains_of_the_jr3_equal_the_docs():
     assert np.cbrt(linear[2] / T) / (2 * np.pi) == pytest.approx(18.4, abs=0.1)
 
 
-# What the elimination leaves of the paper's 100 N
+# Residual of the elimination for the paper's 100 N
 
 
 def left(fast: Array, sensor: WristSensorConfig, source: str) -> tuple[float, float]:
@@ -377,7 +377,7 @@ def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("source", ["encoders", "accelerometer"])
 def test_motion_noise_equals_the_prediction(source, preset):
-    """For encoders on average over the axes."""
+    """Encoders agree on average over the axes."""
     real = without_parts(PRESETS[preset], "random_walk", "offset", "drift", "saturation")
     config = MotionEstimationConfig(source)
     truth = truth_of(swinging(np.arange(16000) * T))

@@ -137,7 +137,7 @@ def compare(run, tolerance, instants, period=1e-3):
     largest = 0.0
     after = run.plant.time_step() > 0 and run.plant.has_sampled_output_ports()
     for k in instants:
-        if k > 0:  # else Drake handles the events of the present instant already
+        if k > 0:  # otherwise Drake handles the events of the present instant
             run.simulator.AdvanceTo(k * period)
         poses = [frame.CalcPoseInWorld(run.context) for frame in (run.S, run.weld.frame_on_child())]
         positions = run.plant.GetPositions(run.context)
@@ -270,7 +270,7 @@ def test_a_weld_from_tool_to_arm_gives_the_wrench_on_the_tool():
 
 @pytest.mark.parametrize("off", ["gripper", "arm"])
 def test_specific_force_has_no_gravity_if_the_tool_has_none(off):
-    """Then V phi equals the wrench nevertheless."""
+    """V phi equals the wrench with and without gravity."""
     run = moving(without_gravity=off)
     run.simulator.AdvanceTo(1e-4)
     wrench = reading(run, "measured_wrench_S")
@@ -386,7 +386,7 @@ def test_two_sensors_in_one_diagram_read_their_own_weld():
     assert diagram.HasSubsystemNamed("foot_sensor_noise")
 
 
-def test_no_sample_from_numbers_that_are_none():
+def test_input_not_finite_gives_no_sample():
     run = moving()
     run.simulator.AdvanceTo(1.5e-3)
     before = reading(run, "measured_wrench_S").copy()
@@ -475,6 +475,6 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_work_is_refused_with_its_reason(name):
+def test_error_states_the_reason_of_a_refused_call(name):
     change, expected = REFUSED[name]
     assert expected in refused(change)

@@ -103,7 +103,7 @@ def test_presets_are_plausible_and_settle_at_the_first_sample(name):
     config.check("sensor", RATE)
     truths = np.repeat(random_truths(1), 400, axis=0)
     found = readings(without_parts(config, *QUIET, "drift"), truths)
-    # The low-pass keeps what the converter rounded, so that it moves within a quantum.
+    # The low-pass stores rounded values, so that its output moves within a quantum.
     quantum = config.resolution * config.ranges()
     assert np.all(np.ptp(found[:, :12], axis=0) <= quantum)
     assert np.ptp(found[:, 12:], axis=0).max() == 0.0
@@ -189,7 +189,7 @@ def test_low_pass_is_a_butterworth_with_settled_start(place):
     np.testing.assert_allclose(found, expected, 1e-9, 1e-9)
 
 
-def test_the_place_of_the_low_pass_decides_what_it_filters():
+def test_low_pass_filters_only_the_effects_before_it():
     truths, noise = np.repeat(random_truths(1), 300, axis=0), random_noise(300)
     raw = part(force_noise=0.2, resolution=1e-3)
     unfiltered = readings(raw, truths, noise)
@@ -278,7 +278,7 @@ def test_saturation_clips_and_flags_with_latency_of_its_path():
 
 
 @pytest.mark.parametrize("low_pass", ["none", "before_noise", "after_converter"])
-def test_the_offset_counts_in_the_saturation(low_pass):
+def test_saturation_includes_the_offset(low_pass):
     """150 N with an offset of 60 N exceed the range of 200 N, with -60 N they do not."""
     truths = np.zeros((400, 15 + JOINTS))
     truths[:, 0] = 150.0
@@ -297,7 +297,7 @@ def test_overload_including_offset_is_not_plausible():
     assert are_values_plausible(constants, truth)
     truth[0] = 0.99 * largest
     assert are_values_plausible(constants, truth)
-    constants.offset[0] = 0.02 * largest  # of the offset
+    constants.offset[0] = 0.02 * largest  # as with the offset
     assert not are_values_plausible(constants, truth)
     truth[0] = 0.0
     assert are_values_plausible(constants, truth)
@@ -316,7 +316,7 @@ def test_overload_including_offset_is_not_plausible():
 
 @given(late=st.lists(st.integers(0, 40), min_size=3, max_size=3), joints=st.integers(1, 7))
 @settings(max_examples=25, deadline=None)
-def test_each_path_is_late_by_its_whole_samples(late, joints):
+def test_latency_of_each_path_is_in_whole_samples(late, joints):
     force, acceleration, encoders = late
     config = part(
         force_latency=(force + 0.4) * PERIOD,
@@ -328,11 +328,11 @@ def test_each_path_is_late_by_its_whole_samples(late, joints):
     found, expected = readings(config, truths), as_read(truths)
     columns = np.repeat(late[:2], 6).tolist() + [0] + [encoders] * joints
     before = np.arange(100)[:, None] - np.array(columns)
-    rows = np.maximum(before, 0)  # before the first sample it rested there
+    rows = np.maximum(before, 0)  # the output is constant before the first sample
     np.testing.assert_array_equal(found, np.take_along_axis(expected, rows, axis=0))
 
 
-def test_the_ideal_sensor_is_never_late():
+def test_ideal_sensor_has_no_latency():
     config = dataclasses.replace(PRESETS["ati_gamma_imu"], ideal=True)
     assert not config.reading_delays(PERIOD).any() and not config.latency_samples(PERIOD).any()
     place, axes = config.accelerometer_pose()
@@ -342,7 +342,7 @@ def test_the_ideal_sensor_is_never_late():
 # Spectrum and Allan deviation
 
 LONG = 2**18
-#: What stands alone, and the two sensors with all of it.
+#: Each effect separately, and the two sensors with all of them.
 AT_REST = {
     "white": part(force_noise=0.25, torque_noise=0.01),
     "white and quantum": part(  # noise of 0.8 quanta: rounding adds 13 % to the power
@@ -392,8 +392,8 @@ def test_allan_deviation_at_rest_equals_prediction(records, name):
     predicted = predicted_allan_deviation(AT_REST[name], lengths, PERIOD)
     noisy = predicted[:, 0] > 0
     assert noisy.any() and found[~noisy].max(initial=0.0) < 1e-9
-    # Of differences that do not overlap, which the estimate is better than; for white noise, which
-    # is the worse of the two.
+    # Deviation of differences without overlap, an upper bound of that of the estimate; for white
+    # noise, the worse of the two.
     deviation = np.sqrt(0.75 / (LONG / lengths - 1))
     assert np.all(np.abs(found[noisy] / predicted[noisy] - 1) <= 5 * deviation)
 

@@ -69,7 +69,7 @@ def test_the_low_pass_is_a_fourth_order_butterworth(rate):
         assert abs(response(cutoff, rate, frequency)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_at_rest_it_reads_weight_and_offset():
+def test_reading_at_rest_is_weight_plus_offset():
     offset = [6.0, -3.0, 8.0, 0.3, -0.4, 0.1]
     result = at_rest(dataclasses.replace(QUIET, offset=offset))
     # S points down: Eq. (1) is -m g, which is m * 9.81 upwards, -z_S.
@@ -105,7 +105,7 @@ def test_channels_are_independent_and_other_seeds_give_other_noise():
 
 
 @pytest.mark.slow
-def test_the_converter_quantises_before_the_filter():
+def test_converter_quantises_before_the_filter():
     """The reading at rest is a whole number of quanta."""
     result = at_rest(dataclasses.replace(QUIET, resolution=2.5e-4))
     force = result["measured_wrench_S"][-1, 2] / (2.5e-4 * 400.0)
@@ -189,7 +189,7 @@ def test_sample_time_is_the_instant_of_the_sample():
 
 
 def test_one_sample_for_equal_instants_with_rounding():
-    """At 7 kHz rounding makes a row's time later than the same instant of the 2 kHz events."""
+    """Rounding at 7 kHz makes a row's time later than the same instant of the 2 kHz events."""
     result = swinging(7000.0)
     np.testing.assert_allclose(result["sample_time"][1:, 0], result.t[:-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(

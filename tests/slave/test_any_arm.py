@@ -52,7 +52,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("station")
     text = other_arm_urdf(slides=4).replace('effort="40"', 'effort="400"')
     text = text.replace('ixy="0.001" ixz="-0.002" iyz="0.0015"', 'ixy="0" ixz="0" iyz="0"')
-    # Of one joint nobody says that it has a motor.
+    # One joint has no statement that it has a motor.
     motor = text[text.index('<transmission type="SimpleTransmission"><joint name="j3"/>') :]
     text = text.replace(motor[: motor.index("</transmission>") + len("</transmission>")], "")
     (folder / "arm.urdf").write_text(text)
@@ -113,7 +113,7 @@ def test_start_pose_and_assumptions(scenario):
     X_WS = plant.GetFrameByName("ft").CalcPoseInWorld(context)
     expected = [*X_WS.rotation().ToQuaternion().wxyz(), *X_WS.translation()]
     np.testing.assert_allclose(start_pose(scenario.slave), expected, atol=1e-12)
-    # Of nothing that says where it touches, the centre of mass; here of hand and finger.
+    # Without shapes the tip is at the centre of mass, here of hand and finger.
     assert slave.arm.phi_load[0] == pytest.approx(0.9)
     np.testing.assert_allclose(slave.tip, slave.arm.phi_load[1:4] / 0.9)
     assert "held: to_finger" in slave.assumptions
@@ -152,7 +152,7 @@ def test_tool_from_mass_and_shapes():
     about_S = about_S + np.triu(about_S, 1).T + m * (c @ c * np.eye(3) - np.outer(c, c))
     expected = [m, *(m * c), *about_S[np.triu_indices(3)]]
     np.testing.assert_allclose(slave.arm.phi_load, expected, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(slave.tip, [0.0, 0.01, 0.13], atol=1e-15)  # half of 0.06, turned
+    np.testing.assert_allclose(slave.tip, [0.0, 0.01, 0.13], atol=1e-15)  # half of 0.06, rotated
     touching = AddSlavePlant(
         DiagramBuilder(), Slave(tool=Tool(mass=2.0, shapes=shapes[:1])), SheetSpring()
     )
@@ -166,7 +166,7 @@ def test_only_load_makes_contact(folder, tmp_path):
     path, tool = tmp_path / "arm.urdf", Tool(mass=1.0, shapes=[Ball()])
     text = (folder / "arm.urdf").read_text()
     slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=tool)
-    for link, watched in (("l7", 0), ("hand", 1)):  # a ball that does not say how stiff it is
+    for link, watched in (("l7", 0), ("hand", 1)):  # a ball without stiffness
         path.write_text(text.replace(f'<link name="{link}">', f'<link name="{link}">{ball}'))
         contact = AddSlavePlant(DiagramBuilder(), slave, SheetSpring()).contact
         assert (len(contact.monitored_pairs), len(contact.tool_shapes)) == (watched, 1 + watched)
@@ -319,7 +319,7 @@ def test_tip_is_between_fingers_of_gripper(folder, scenario):
     (folder / "gripper.urdf").write_text(text)
     slave = dataclasses.replace(scenario.slave, model=str(folder / "gripper.urdf"))
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.02, 0.13], atol=1e-12)
-    # A mesh reaches as far as its points do: this one between the fingers, with an edge on top.
+    # The size of a mesh is that of its points: this one between the fingers, with an edge on top.
     points = [(-0.01, -0.01, 0.0), (0.01, 0.01, 0.0), (-0.01, 0.01, 0.03), (0.01, -0.01, 0.05)]
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in points)
     (folder / "wedge.obj").write_text(corners + "f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")

@@ -1,4 +1,4 @@
-"""Joints that turn without end: limits, commands over four turns, start, excitation, summary."""
+"""Continuous joints: limits, commands over four rotations, start, excitation, summary."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.slow
 SIX = ("z 0.3 -2.9 2.9", "y 0.1 -2 2", "y 0.4 -2.6 2.6", "z 0.2 -3 3", "y 0.2 -2.1 2.1", "z 0.1")
 SEVEN = ("z 0.16", "y 0.13 -2.2 2.2", "z 0.2", "y 0.2 -2.5 2.5", "z 0.2", "y 0.1 -2 2", "z 0.1")
 POSTURES = {SIX: [0.3, 0.6, 1.2, 0.2, 1.0, 0.4], SEVEN: [0.3, 0.6, 0.4, 1.4, 0.3, 1.0, 0.4]}
-#: Period of the commands [s], rate of the tool [rad/s], angle of four turns.
+#: Period of the commands [s], rate of the tool [rad/s], angle of four rotations.
 PERIOD, RATE, TURNS = 1e-3, 2.0, 8 * np.pi
 AXES = {"y": "0 1 0", "z": "0 0 1"}
 
@@ -89,13 +89,13 @@ def pose_of(arm, q):
 
 
 def turned_tool(pose, angle):
-    """Return the pose turned about z_S."""
+    """Return the pose rotated about z_S."""
     turn = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
     return np.append(quaternion_product(tuple(pose[:4]), turn), pose[4:])
 
 
 def turned_base(pose, angle):
-    """Return the pose turned about z_W."""
+    """Return the pose rotated about z_W."""
     turn, c, s = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)), np.cos(angle), np.sin(angle)
     x, y, z = pose[4:]
     return np.append(quaternion_product(turn, tuple(pose[:4])), [c * x - s * y, s * x + c * y, z])
@@ -107,7 +107,7 @@ def pose_error(a, b):
 
 
 def commands_of_four_turns(system, arm, start, sign, turned=turned_tool):
-    """Return the joint commands while the tool turns, and 2 s later, and the largest error."""
+    """Return the joint commands while the tool rotates, and 2 s later, and the largest error."""
     context, pose, error = system.CreateDefaultContext(), pose_of(arm, start), 0.0
     command, status = (system.GetOutputPort(name) for name in ("joint_command", "ik_status"))
     q = np.array(start)
@@ -128,7 +128,7 @@ def commands_of_four_turns(system, arm, start, sign, turned=turned_tool):
 
 @pytest.mark.parametrize(("chain", "sign"), [(SIX, 1), (SEVEN, -1)])
 def test_four_turns_of_the_tool_are_followed_without_a_jump(chain, sign):
-    """The last joint turns alone, also that of a redundant arm."""
+    """Only the last joint rotates, also for a redundant arm."""
     arm, start = ARMS[chain], POSTURES[chain]
     system = NumericInverseKinematics(arm, start, PERIOD)
     q, error = commands_of_four_turns(system, arm, start, sign)
@@ -139,7 +139,7 @@ def test_four_turns_of_the_tool_are_followed_without_a_jump(chain, sign):
 
 
 def test_redundant_arm_approaches_the_nearest_turn_of_its_posture():
-    """The posture does not wind joint 1 back while the arm turns about its base."""
+    """The posture does not rotate joint 1 back while the arm rotates about its base."""
     arm, start = ARMS[SEVEN], POSTURES[SEVEN]
     system = NumericInverseKinematics(arm, start, PERIOD)
     q, error = commands_of_four_turns(system, arm, start, 1, turned_base)
@@ -197,7 +197,7 @@ LIMIT = 'lower="-2.2" upper="2.2"'
         ("prismatic", 'lower="0.2"', (0.2, 2.2), "a range of 2 m"),
     ],
 )
-def test_limits_of_a_joint(kind, limit, expected, words):
+def test_limits_of_a_joint_are_read_or_assumed(kind, limit, expected, words):
     text = urdf(SEVEN).replace('"j2" type="revolute"', f'"j2" type="{kind}"')
     arm, assumed = arm_of(text.replace(LIMIT, limit, 1))
     assert (arm.lower[1], arm.upper[1]) == pytest.approx(expected)

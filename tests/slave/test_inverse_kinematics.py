@@ -154,7 +154,7 @@ def test_pose_is_met_near_wrist_singularity(arm, q5):
     R_found, p_found = forward(arm, q)
     np.testing.assert_allclose(R_found, R, atol=2e-9)
     np.testing.assert_allclose(p_found, p, atol=1e-9)
-    # Coming from the singularity, the nearer wrist branch turns joint 4 by a quarter turn at most.
+    # From the singularity on, the nearer wrist branch rotates joint 4 by 90 degrees at most.
     assert abs(q[3] - 0.3) <= np.pi / 2 + 1e-6
 
 

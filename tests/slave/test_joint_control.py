@@ -51,7 +51,7 @@ def test_torque_with_invalid_encoders_or_command(arm, bad):
     gravity = torque(arm, q, q, np.zeros(6))
     np.testing.assert_array_equal(torque(arm, q, q + one, np.ones(6)), gravity)
     np.testing.assert_array_equal(torque(arm, q, q + 0.1, one), gravity)
-    np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # what stood there
+    np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # previous content
 
 
 def test_joints_are_decoupled(arm):
@@ -74,7 +74,7 @@ def test_torque_stays_within_motor_limits(arm):
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize("share", [0.999, 1.0, 1.001])
 def test_joint_does_not_accelerate_beyond_speed_limit(arm, way, share):
-    """Beyond the limit it brakes, however far the setpoint; the block equals the formula."""
+    """The joint brakes beyond the limit for any setpoint; the block equals the formula."""
     q, config = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), JointControlConfig()
     limit = way * arm.velocity_limit
     braking = 2 * np.pi * config.velocity_bandwidth_hz * (1.0 - share) * limit

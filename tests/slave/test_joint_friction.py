@@ -17,7 +17,7 @@ FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
 
 
 class Arm:
-    """The plant alone, with constant motor torques."""
+    """Plant alone, with constant motor torques."""
 
     def __init__(self, friction):
         builder = DiagramBuilder()
@@ -83,7 +83,7 @@ def test_joint_creeps_below_friction_torque(arm):
     arm.simulator.Initialize()
     arm.simulator.AdvanceTo(0.1)
     q, v = arm.state()
-    # Gravity's torque changes on the way, by N m a rad.
+    # Gravity's torque changes during the motion, by N m a rad.
     np.testing.assert_allclose(v, 2e-3 * np.arctanh(share), atol=3e-5)
     assert (np.abs(q - arm.slave.start) <= 0.1 * 2e-3 * np.arctanh(np.abs(share)) + 1e-5).all()
 

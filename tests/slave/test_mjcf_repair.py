@@ -71,7 +71,7 @@ def test_second_joint_of_rotated_body_moves_after_the_first(tmp_path, s, q):
         ('zaxis="0 0 -1"', "", degrees(180, 0, 0)),
     ],
 )  # fmt: skip
-def test_orientation_of_a_body(tmp_path, orientation, compiler, expected):
+def test_body_orientation_is_read_in_every_form(tmp_path, orientation, compiler, expected):
     text = mjcf(arm(attributes=f'pos="1 2 3" {orientation}'), f"<compiler {compiler}/>")
     _, model, _ = read(written(tmp_path, text, "a.xml"), "S")
     found = pose(model, [0.0])
@@ -91,7 +91,7 @@ def test_frames_and_classes_of_included_files_apply(tmp_path):
     path = written(tmp_path, "<mujoco><include file='parts/arm.xml'/></mujoco>", "a.xml")
     _, model, said = read(path, "S")
     assert (model.lower, model.upper) == (-1.0, 2.0)
-    # The joint turns about the world's -x, through a point 0.1 m above the body's origin.
+    # The joint rotates about the world's -x, through a point 0.1 m above the body's origin.
     np.testing.assert_allclose(
         pose(model, [0.7])[:, 3], [1, 0.4 * np.sin(0.7), 0.1 + 0.4 * np.cos(0.7)], atol=1e-12
     )
@@ -110,7 +110,7 @@ def test_frames_and_classes_of_included_files_apply(tmp_path):
         ("", "", (-np.inf, np.inf)),
     ],
 )
-def test_position_limits(tmp_path, joint, compiler, expected):
+def test_position_limits_follow_the_compiler(tmp_path, joint, compiler, expected):
     text = mjcf(arm(f'<joint name="j" {joint}/>'), f"<compiler {compiler}/>")
     _, model, _ = read(written(tmp_path, text, "a.xml"), "S")
     np.testing.assert_allclose((model.lower[0], model.upper[0]), expected)
@@ -199,7 +199,7 @@ def write_cube(folder, suffix, offset=0.0):
         *(('type="mesh" mesh="beam"', s) for s in ("msh", "obj")),
     ],
 )
-def test_mass_of_shapes(tmp_path, shape, suffix):
+def test_mass_and_moments_of_shapes_are_closed_forms(tmp_path, shape, suffix):
     """The second moments are those about the joint, 0.4 m below the shape."""
     (tmp_path / "parts").mkdir()
     write_cube(tmp_path / "parts", suffix, offset=1.0)
@@ -233,7 +233,7 @@ def test_mass_of_shapes(tmp_path, shape, suffix):
     ],
 )
 @pytest.mark.parametrize("sides", [(1, 2, 3), (3, 1, 2), (2, 3, 1)])
-def test_primitive_that_replaces_a_mesh(kind, by_box, expected, sides):
+def test_primitive_replaces_a_mesh_with_its_pose_and_size(kind, by_box, expected, sides):
     """A box of 0.1 x 0.2 x 0.3 m, in any order and orientation; z is the longest axis."""
     X = RigidTransform(degrees(10, 20, 30), [0.4, -0.5, 0.6])
     triangles = Triangles(X.multiply((CORNERS * sides).T).T, FACES)
@@ -256,7 +256,7 @@ def test_primitive_that_replaces_a_mesh(kind, by_box, expected, sides):
         ({"refquat": "0 1 0 0"}, "a.obj", False),
     ],
 )
-def test_drake_reads_a_mesh_itself_if_it_stays_as_it_is(tmp_path, attributes, file, expected):
+def test_mesh_that_drake_can_read_is_recognized(tmp_path, attributes, file, expected):
     path, report = written(tmp_path, mjcf(""), "a.xml"), RepairReport()
     reader = Mjcf(read_xml(path), path, ModelFiles(path, ()), report)
     mesh = Mesh(reader, Attributes(attributes, "mesh", report), Path(file))
@@ -273,7 +273,7 @@ def test_drake_reads_a_mesh_itself_if_it_stays_as_it_is(tmp_path, attributes, fi
         ("legacy", 8.61754009),
     ],
 )
-def test_mass_of_a_mesh_that_is_not_convex(tmp_path, mode, expected):
+def test_mass_of_a_non_convex_mesh_follows_its_inertia_mode(tmp_path, mode, expected):
     outline = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
     vertices = [(x, y, z) for z in (0, 1) for x, y in outline]
     lower = [(4, 1, 0), (5, 4, 0), (3, 2, 1), (4, 3, 1), (6, 5, 0), (7, 6, 0)]
@@ -296,8 +296,8 @@ def test_mass_of_a_mesh_that_is_not_convex(tmp_path, mode, expected):
         ('balanceinertia="true"', "0.02 0.03 0.10", 0.05),
     ],
 )
-def test_inertia_by_the_compiler(tmp_path, compiler, moments, expected):
-    """The joint turns about y."""
+def test_compiler_bounds_and_balances_inertia(tmp_path, compiler, moments, expected):
+    """The joint rotates about y."""
     inertial = f'<inertial pos="0 0.1 0" mass="1" diaginertia="{moments}"/>'
     text = mjcf(arm(inertial=inertial), f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")
@@ -316,7 +316,7 @@ def test_inertia_by_the_compiler(tmp_path, compiler, moments, expected):
         ('settotalmass="6"', '<geom size="0.1" mass="0.7"/>', 4.2),  # of 1 kg in the file
     ],
 )
-def test_mass_by_the_compiler(tmp_path, compiler, geoms, expected):
+def test_compiler_sets_the_mass(tmp_path, compiler, geoms, expected):
     cup = '<body><freejoint/><geom size="0.1" mass="0.3"/></body>'
     text = mjcf(arm(inside=geoms, inertial="") + cup, f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")
@@ -325,7 +325,7 @@ def test_mass_by_the_compiler(tmp_path, compiler, geoms, expected):
 
 
 @pytest.mark.parametrize(("sensor", "beyond"), [("", 0.0), ("force", 3.0), ("torque", 3.0)])
-def test_site_as_sensor_frame(tmp_path, sensor, beyond):
+def test_site_is_the_sensor_frame(tmp_path, sensor, beyond):
     """The site of a force sensor carries its body, as in MuJoCo; another one is on its body."""
     hand = (
         '<body name="h" pos="0 0 1" euler="0 0 90"><joint name="k" axis="1 0 0"/>'

@@ -90,7 +90,7 @@ OFF_CHAIN += joint(21, "planar", parent="l4", child="a") + joint(22, "floating",
 OFF_CHAIN += joint(23, parent="l4", child="c", inside='<mimic joint="j2" multiplier="-1"/>')
 OFF_CHAIN += joint(24, "hinge", parent="c", child="d").replace("0 0 1", "0 0 0")
 OFF_CHAIN += joint(25, parent="l6", child="e").replace(LIMIT, '<limit lower="2" upper="1"/>')
-# Defects of published files, and what is stated about them.
+# Defects of published files, and the statement about them.
 LOOKALIKES = {
     "six-joint arm with rounded and thin links": (
         arm(l3=link("l3", INERTIAL.replace('izz="0.01"', 'izz="0.0405"')))
@@ -478,7 +478,7 @@ def test_colours_have_four_numbers_from_0_to_1(rgba, kept):
 @pytest.mark.parametrize("izz", [0.04, 0.09])
 @pytest.mark.parametrize("is_sdf", [False, True])
 def test_products_of_inertia_are_kept(izz, is_sdf):
-    """With 0.09 the nearest possible inertia is written."""
+    """The nearest possible inertia is written for 0.09."""
     inertia = np.array([[0.03, 4e-3, -5e-3], [4e-3, 0.035, 6e-3], [-5e-3, 6e-3, izz]])
     entries = {f"i{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)}
     inner = "".join(f"<{name}>{value}</{name}>" for name, value in entries.items())

@@ -32,11 +32,11 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
 )
 from drake_teleop.station.station import MakeTeleopStation
 
-# What compiles takes three seconds, once.
+# Functions are compiled once, within three seconds.
 pytestmark = pytest.mark.slow
 
 PERIOD = 5e-4
-#: The RX90 with its elbow well bent and its wrist stretched.
+#: RX90 with its elbow bent and its wrist stretched.
 STRETCHED = np.array([0.2, -0.5, -1.6, 0.7, 0.0, 0.4])
 BENT = np.array([0.2, -0.5, -1.6, 0.7, 0.8, 0.4])
 
@@ -181,10 +181,10 @@ def test_joint_speed_stays_within_limits_at_singular_wrist(rx90, aside):
     def numeric(pose, reference):
         return follow(rx90, pose, reference, max_step=arm.velocity_limit * PERIOD)
 
-    assert sweep(rx90, start, closed)[0] > 20  # it is a singularity that is crossed
+    assert sweep(rx90, start, closed)[0] > 20  # the motion crosses a singularity
     largest, errors, statuses = sweep(rx90, start, numeric)
     assert largest < 1 + 1e-9
-    assert max(errors) < 1e-5  # the rest of it goes slowly
+    assert max(errors) < 1e-5  # the rest is slow
     assert {IkStatus.OK, IkStatus.WRIST_SINGULAR, IkStatus.SPEED_LIMIT} <= statuses
     assert IkStatus.JOINT_LIMIT not in statuses
 
@@ -304,7 +304,7 @@ def test_system_continues_from_last_command(rx90):
         assert np.all(np.abs(q - before) <= rx90.arm.velocity_limit * PERIOD * (1 + 1e-9))
         state = system.EvalUniquePeriodicDiscreteUpdate(context)
         context.SetDiscreteState(state)
-        # Once taken, the command stays what it was.
+        # The first command is kept.
         np.testing.assert_array_equal(command.Eval(context), q)
     np.testing.assert_allclose(q, goal, atol=1e-9)
     system.GetInputPort("joint_position").FixValue(context, np.full(6, np.nan))
@@ -312,7 +312,7 @@ def test_system_continues_from_last_command(rx90):
     context.SetTime(1.0)
     np.testing.assert_array_equal(command.Eval(context), q)
     assert status.Eval(context) == [IkStatus.BAD_POSE]
-    # From ports and states as from arrays: nothing is compiled for them alone.
+    # Ports, states and arrays share the compiled functions.
     assert len(follow_pose.signatures) == 1
 
 

@@ -80,7 +80,7 @@ def test_speed_and_acceleration_stay_within_the_limits(arm):
 
 
 def test_distant_target_is_reached_without_overshoot(arm):
-    """With a fast interface of weak motors, a linear law would overshoot."""
+    """A linear law would overshoot with a fast interface of weak motors."""
     franka = POSITION_INTERFACES["franka_position"]
     states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
     moved = states[:, :6] - HOME

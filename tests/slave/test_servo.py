@@ -28,7 +28,7 @@ def home(arm):
 
 
 def test_operational_inertia_gives_kinetic_energy(arm, home):
-    """Against the mass matrix from the inverse dynamics, column by column."""
+    """Compare with the mass matrix from the inverse dynamics, column by column."""
     still, weight, J = np.zeros(6), np.empty(6), np.empty((6, 6))
     inverse_dynamics(arm.table, home, still, still, weight)
     mass = np.empty((6, 6))

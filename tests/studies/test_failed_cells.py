@@ -202,7 +202,7 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     assert known[(x == 3) & (y == 1)].sum() == 1
 
 
-def looked(design: str) -> tuple[Study, pl.DataFrame]:
+def study_with_gaps(design: str) -> tuple[Study, pl.DataFrame]:
     """Return a study without points in a corner and in some random cells."""
     factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
     study = Study(factors=factors, design=design, samples=32, objective=EFFORT, measures=[EFFORT])
@@ -213,7 +213,7 @@ def looked(design: str) -> tuple[Study, pl.DataFrame]:
 
 
 def test_cell_without_point_is_empty_but_does_not_exclude_levels():
-    study, rows = looked("sobol")
+    study, rows = study_with_gaps("sobol")
     (pair,) = pair_means(study, rows, EFFORT)
     points = rows.select("a.x", "a.y").to_numpy()
     there = np.histogram2d(*points.T, bins=5, range=[[0, 1], [0, 1]])[0] > 0
@@ -226,7 +226,7 @@ def test_cell_without_point_is_empty_but_does_not_exclude_levels():
 
 
 def test_adaptive_design_has_no_value_in_unsearched_cells():
-    study, rows = looked("adaptive")
+    study, rows = study_with_gaps("adaptive")
     for found in main_effects(study, rows, EFFORT).values():
         assert found.num_unused_combinations > 0
         shown = np.isfinite(found.effect)

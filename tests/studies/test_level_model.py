@@ -15,14 +15,14 @@ UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)
 
 
-def known(points):
-    """Linear in x, quadratic in y, with their product; independent of z."""
+def true_function(points):
+    """Function linear in x, quadratic in y, with their product; independent of z."""
     x, y, _ = points.T
     return 5 * x + np.sin(5 * y) + 3 * x * y
 
 
 def true_effects() -> list[np.ndarray]:
-    """Return the means of `known` over each fifth of each factor, minus the mean of all."""
+    """Return the means of `true_function` over each fifth of each factor, minus the mean of all."""
     middles = (EDGES[1:] + EDGES[:-1]) / 2 - 0.5
     bent = -np.diff(np.cos(5 * EDGES)) / 5 / np.diff(EDGES)
     return [6.5 * middles, bent - bent.mean() + 1.5 * middles, np.zeros(5)]
@@ -43,7 +43,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
     inside, plain, null = [], [], []
     for draw in range(200):
         points = qmc.Sobol(3, seed=np.random.default_rng(draw)).random_base2(6)
-        table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
+        table = true_function(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
         table = table + random.normal(0, noise, table.shape)
         known_there = ~(corner & (points[:, 0] > 0.6) & (points[:, 1] < 0.4))
         model = fit_level_model(UNIT, points.T.tolist(), known_there)
@@ -61,7 +61,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
     assert np.median(null) < 0.5 * np.median(plain)
 
 
-def made_up(study: Study, value, fields=("a.x", "a.y", "a.w")) -> pl.DataFrame:
+def fake_rows(study: Study, value, fields=("a.x", "a.y", "a.w")) -> pl.DataFrame:
     rows = study.rows(study.points())
     for row in rows:
         row["hand_work_J"] = value(*(row[field] for field in fields), row["seed"])
@@ -84,7 +84,7 @@ def force(x, y, word, seed):
 def test_irrelevant_factor_has_no_significant_effect():
     """Plain means of its three levels differ by 2.2 N, because x and y differ."""
     study = sobol(32, repeats=2, seed=104)
-    rows = made_up(study, force)
+    rows = fake_rows(study, force)
     plain = rows.group_by("a.w").agg(pl.col("hand_work_J").mean())["hand_work_J"].to_numpy()
     found = main_effects(study, rows, "hand_work_J")
     word = found["a.w"]
@@ -100,8 +100,8 @@ def test_irrelevant_factor_has_no_significant_effect():
 
 def test_intervals_contain_seed_dependent_effects():
     study = sobol(64, repeats=3)
-    alike = main_effects(study, made_up(study, force), "hand_work_J")
-    rows = made_up(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
+    alike = main_effects(study, fake_rows(study, force), "hand_work_J")
+    rows = fake_rows(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
     apart = main_effects(study, rows, "hand_work_J")
     assert apart["a.x"].effect_half_width[0] > 5 * alike["a.x"].effect_half_width[0]
     assert apart["a.y"].effect_half_width[0] < 1.5 * alike["a.y"].effect_half_width[0]
@@ -109,7 +109,7 @@ def test_intervals_contain_seed_dependent_effects():
 
 def test_exact_fit_has_a_width_of_rounding():
     study = sobol(64)
-    found = main_effects(study, made_up(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
+    found = main_effects(study, fake_rows(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
     for name, truth in (("a.x", 3 * np.array([-0.4, -0.2, 0, 0.2, 0.4])), ("a.y", np.zeros(5))):
         assert np.all(np.abs(found[name].effect - truth) <= found[name].effect_half_width)
         assert np.all(found[name].effect_half_width < 1e-8)
@@ -118,7 +118,7 @@ def test_exact_fit_has_a_width_of_rounding():
 def test_failed_point_does_not_change_other_effects():
     factors = [Factor("a.x", values=[0.0, 1.0, 4.0]), Factor("a.y", values=[1.0, 2.0, 3.0, 5.0])]
     study = Study(factors=factors, repeats=2, measures=["hand_work_J"])
-    rows = made_up(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
+    rows = fake_rows(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
     whole = effects_table(study, rows)
     broken = rows.with_columns(
         hand_work_J=pl.when(pl.col("point").is_in([0, 5])).then(None).otherwise("hand_work_J")
@@ -134,7 +134,7 @@ def test_failed_point_does_not_change_other_effects():
 
 def test_pair_means_equal_the_function():
     study = sobol(64)
-    rows = made_up(study, lambda x, y, w, seed: 8 * x * y + (3 * y if w == "real" else 0))
+    rows = fake_rows(study, lambda x, y, w, seed: 8 * x * y + (3 * y if w == "real" else 0))
     pairs = {found.fields: found for found in pair_means(study, rows, "hand_work_J")}
     assert len(pairs) == 3
     x, y = np.meshgrid(*(2 * [(EDGES[1:] + EDGES[:-1]) / 2]), indexing="ij")
@@ -142,14 +142,14 @@ def test_pair_means_equal_the_function():
     expected = np.column_stack([4 * y[0], 7 * y[0], 4 * y[0]])
     np.testing.assert_allclose(pairs["a.y", "a.w"].mean, expected, atol=1e-9)
     few = sobol(16)
-    assert pair_means(few, made_up(few, force), "hand_work_J") == []
+    assert pair_means(few, fake_rows(few, force), "hand_work_J") == []
 
 
 def test_too_few_points_give_no_effects():
     study = sobol(2)
-    found = main_effects(study, made_up(study, force), "hand_work_J")
+    found = main_effects(study, fake_rows(study, force), "hand_work_J")
     assert all(np.isnan(one.effect).all() for one in found.values())
-    nothing = made_up(study, lambda *_: None)
+    nothing = fake_rows(study, lambda *_: None)
     assert main_effects(study, nothing, "hand_work_J") == {}
 
 

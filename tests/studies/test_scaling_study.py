@@ -121,9 +121,9 @@ def test_shipped_studies_share_their_scales():
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_scaling_study_command_writes_its_answer(tmp_path, monkeypatch):
-    """With synthetic rows instead of runs."""
+    """The rows are synthetic."""
 
-    def made_up(name, out, *, repeats, **others):
+    def fake_rows(name, out, *, repeats, **others):
         study = LoadStudy(name)
         assert repeats is None
         noise, rows = np.random.default_rng(0), study.rows(study.points())
@@ -133,7 +133,7 @@ def test_scaling_study_command_writes_its_answer(tmp_path, monkeypatch):
         (out / "runs.parquet").mkdir(parents=True)
         pl.DataFrame(rows).write_parquet(out / "runs.parquet" / "run_00000000.parquet")
 
-    monkeypatch.setattr(scaling_study, "study_command", made_up)
+    monkeypatch.setattr(scaling_study, "study_command", fake_rows)
     monkeypatch.chdir(tmp_path)
     type_in("docs/scaling-study.md", "drake-teleop scaling-study")
     out = tmp_path / "out" / "scaling-study"

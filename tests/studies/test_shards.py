@@ -42,7 +42,7 @@ def run(out, study=STUDY, function=work, **options):
 
 @pytest.fixture(autouse=True)
 def parts_of_several_runs(monkeypatch):
-    """As in a large study."""
+    """Use several runs per part, as in a large study."""
     monkeypatch.setattr(runs, "_TARGET_NUM_CHUNKS", 20)
 
 
@@ -200,7 +200,7 @@ main([sys.argv[1], "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1",
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [False, True])
 def test_dask_worker_of_another_version_is_refused_by_name(tmp_path, late, monkeypatch):
-    """It is also refused if it joins a study that runs already."""
+    """A worker that joins a running study is refused as well."""
     from distributed import LocalCluster
 
     def nested(values, seed):  # needs no import of this file

@@ -132,18 +132,18 @@ def two_runs(monkeypatch):
         factors += [dataclasses.replace(f, values=f.values[:1]) for f in others]
         return dataclasses.replace(study, factors=factors, samples=2, repeats=1)
 
-    def alone(*arguments, **options):
+    def in_one_process(*arguments, **options):
         return command(*arguments, **(options | {"jobs": 1}))
 
     monkeypatch.setattr(studies, "LoadStudy", small)
-    monkeypatch.setattr(studies, "study_command", alone)
+    monkeypatch.setattr(studies, "study_command", in_one_process)
 
 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
-    """With two runs each."""
+def test_commands_and_code_of_the_docs_run(two_runs, tmp_path, monkeypatch):
+    """Each study has two runs."""
     monkeypatch.chdir(tmp_path)
     docs = Path(__file__).parents[2] / "docs"
     page = (docs / "studies.md").read_text(encoding="utf-8")
@@ -358,7 +358,7 @@ def test_interrupt_reports_stored_runs(tmp_path):
     assert len(calls) == 5  # the third run again
 
 
-def dying(own: int, at: float):
+def fatal_run(own: int, at: float):
     """Return a run that ends its process at one value; a closure needs no import."""
 
     def work(values, seed):
@@ -376,7 +376,7 @@ def dying(own: int, at: float):
 def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
     factor = Factor("a.b", low=0.0, high=9.0, levels=10)
     study = Study(factors=[factor], measures=["hand_work_J"])
-    rows = run_study(study, tmp_path, dying(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
+    rows = run_study(study, tmp_path, fatal_run(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
     assert rows["run"].to_list() == list(range(10))
     failed = rows.filter(pl.col("error").is_not_null())
     assert failed["a.b"].to_list() == [3.0]
@@ -673,11 +673,11 @@ def test_too_large_study_is_refused_before_its_design(files, tmp_path, monkeypat
 
 
 def test_many_runs_require_consent(files, tmp_path, monkeypatch):
-    class Begun(Exception):
+    class RunBegun(Exception):
         pass
 
     def begin(*arguments, **options):
-        raise Begun
+        raise RunBegun
 
     monkeypatch.setattr(studies, "run_study", begin)
     path, out, asked = files / "many.yaml", tmp_path / "out", []
@@ -691,10 +691,10 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
         study_command(path, out, yes=lambda question: asked.append(question))
     assert asked == [f"{path}: 100,200 runs. Begin?"]
     for yes in (True, lambda question: True):
-        with pytest.raises(Begun):
+        with pytest.raises(RunBegun):
             study_command(path, out, yes=yes)
     path.write_text(MANY.replace("LEVELS", "500"))
-    with pytest.raises(Begun):
+    with pytest.raises(RunBegun):
         study_command(path, out, yes=lambda question: pytest.fail("nobody need ask"))
 
 

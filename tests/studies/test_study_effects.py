@@ -114,7 +114,7 @@ def test_only_applicable_pictures_are_written(tmp_path):
     assert write_pictures(alone, failed, tmp_path) == []
 
 
-def test_range_of_a_sobol_design_is_cut_into_equal_parts():
+def test_range_of_a_sobol_design_has_equal_parts():
     factor = Factor("force_scaling.gamma", low=1.0, high=2.0)
     study = Study(factors=[factor], design="sobol", samples=16, measures=["success"])
     found = effects_table(study, table(study))

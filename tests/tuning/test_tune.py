@@ -112,7 +112,7 @@ def test_tuned_settings_render_the_force_more_exactly_than_required():
 
 
 class FakeStation:
-    """Answers of a station that is stable with `ledger` below a product of gamma and wall.
+    """Station that is stable with `ledger` below a product of gamma and wall.
 
     `noise` [N] is the force at rest for gamma = 1. With a medium grip, walls softer than the
     stiffest one fail above `soft_wall_limit`.
