@@ -19,7 +19,6 @@ from textwrap import TextWrapper
 from typing import Any, NamedTuple, TypeVar
 
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
-from drake_teleop.common.files import models_dir
 from drake_teleop.common.registry import Registry
 
 TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
@@ -69,24 +68,23 @@ def plain(
 def with_absolute_paths(config: Any, folder: Path) -> Any:
     """Return a copy with absolute paths, also in inner blocks; relative ones begin in `folder`.
 
-    Names of shipped models remain, unless `folder` contains such a file.
+    The default of a field, a shipped model, remains unless `folder` contains such a file.
     """
 
-    def resolve(value: Any, is_path: bool) -> Any:
+    def resolve(value: Any, entry: dataclasses.Field[Any]) -> Any:
         if isinstance(value, list):
-            return [resolve(item, is_path) for item in value]
+            return [resolve(item, entry) for item in value]
         if dataclasses.is_dataclass(value):
             return with_absolute_paths(value, folder)
-        if not is_path or not value:
+        if not entry.metadata.get("is_path") or not value:
             return value
         path = (folder / value).resolve()
-        is_shipped = not os.path.exists(path) and os.path.isfile(models_dir() / value)
-        return value if is_shipped else str(path)
+        return value if value == entry.default and not os.path.isfile(path) else str(path)
 
     changes = {}
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
-        if (resolved := resolve(value, entry.metadata.get("is_path", False))) != value:
+        if (resolved := resolve(value, entry)) != value:
             changes[entry.name] = resolved
     return dataclasses.replace(config, **changes) if changes else config
 

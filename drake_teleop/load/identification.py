@@ -32,6 +32,8 @@ MAX_IDENTIFIED_STD_SHARE = 0.05
 _MAX_WEAKLY_IDENTIFIED_STD_SHARE, _MIN_LOAD_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
 _MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
 _OPTIONAL_FILE_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
+# Names in the file that are computed from the fields.
+_DERIVED_FIELDS = ("mass", "com", "inertia_com", "physically_consistent")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,11 +150,13 @@ class Identification:
         """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
         expect_type((str, Path), path, "load")
         document = _read_document(path)
-        known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
-        known |= {"verdicts"}
-        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FILE_FIELDS - document.keys())):
-            problem = "is missing" if name in known else "is not a field of identification.json"
-            raise DrakeTeleopError(problem, where=f"{path}:{name}")
+        known = (*cls.__dataclass_fields__, *_DERIVED_FIELDS, "verdicts")
+        for name in (*known, *document):
+            if name not in known:
+                problem = "is not a field of identification.json"
+                raise DrakeTeleopError(problem, where=f"{path}:{name}")
+            if name not in document and name not in _OPTIONAL_FILE_FIELDS:
+                raise DrakeTeleopError("is missing", where=f"{path}:{name}")
 
         def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
             if not _contains_only_numbers(document[name]):
@@ -204,8 +208,7 @@ class Identification:
         return result
 
     def _derived_quantities(self) -> dict[str, Any]:
-        names = ("mass", "com", "inertia_com", "physically_consistent")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in _DERIVED_FIELDS}
 
 
 def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:

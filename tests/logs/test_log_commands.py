@@ -296,7 +296,12 @@ def test_robust_offsets_ignore_a_contact() -> None:
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [(None, "cannot be read"), ("{", "is not JSON"), ("{}", "phi"), ('{"phi": [1, 2]}', "phi")],
+    [
+        (None, "cannot be read"),
+        ("{", "is not JSON"),
+        ("{}", ":phi: is missing"),
+        ('{"phi": [1, 2]}', ":offsets: is missing"),
+    ],
 )
 def test_invalid_load_file_raises(tmp_path: Path, text: str | None, words: str) -> None:
     log, load_file = simulated(tmp_path / "log.parquet"), tmp_path / "load.json"
