@@ -2,7 +2,8 @@
 
 `python benchmarks/tuning.py [--stations 20] [--draws 500] [--station-draws 4] [--json FILE]` draws
 stations from arms, devices, networks and force scales (seeds from `--first-seed`, default 5;
-`tune` was developed on 0 to 4). For each it tunes for light to firm grips at walls of 0.5 to 20 kN/m, then draws:
+`tune` was developed on 0 to 4). For each it tunes for light to firm grips at walls of 0.5 to
+20 kN/m, then draws:
 
 inside    share of random grips, walls and seeds in the stated set that do not rest quietly or do
           not render 0.9 to 1.1 of the contact force: `--draws` in one axis, `--station-draws` in
