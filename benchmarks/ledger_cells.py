@@ -340,7 +340,7 @@ def missed(row: dict[str, Any]) -> list[str]:
 
 def run_cell(seed: int, index: int, method: str, known: str | None, slip: float) -> dict[str, Any]:
     """Run one cell; return its conditions, figures and failed criteria."""
-    Surface.slip = slip  # type: ignore[method-assign, assignment]
+    Surface.slip_speed = slip  # type: ignore[method-assign, assignment]
     drawn = KNOWN[known] if known else draw(seed, index)
     scenario, times = scenario_of(drawn, seed + index)
     scenario = replace(scenario, passivity=PassivityConfig(method=method))

@@ -65,9 +65,12 @@ def next_participant(store: TrialStore, trials: int, wanted: int | None = None) 
 def _simulate_participants(
     experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
-    from drake_teleop.live.experiment.simulated import make_all_apparatus, simulate_participant
+    from drake_teleop.live.experiment.simulated import (
+        make_apparatus_by_task_and_condition,
+        simulate_participant,
+    )
 
-    stations = make_all_apparatus(experiment, scenarios)
+    stations = make_apparatus_by_task_and_condition(experiment, scenarios)
 
     def print_progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)

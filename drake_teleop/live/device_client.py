@@ -111,7 +111,7 @@ class DeviceClient:
         if behind:
             self.force_ages_s.append(behind)
         x, y, z = map(float, pose.position)
-        w, i, j, k = map(float, pose.orientation)
+        w, i, j, k = map(float, pose.quaternion_wxyz)
         state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
         try:
             self._socket.send(pack_state(state))

@@ -121,7 +121,7 @@ class DeviceLink:
             return {"held": 0, "clutch": 0}
         first = self._origin
         turn = quaternion_logarithm(
-            quaternion_product(state.orientation, conjugate_quaternion(first.orientation))
+            quaternion_product(state.quaternion_wxyz, conjugate_quaternion(first.quaternion_wxyz))
         )
         values: dict[str, float] = {"held": 1}
         for k, name in enumerate("xyz"):

@@ -27,7 +27,7 @@ class DeviceState(NamedTuple):
 
     Attributes:
         position: p_BE [m].
-        orientation: R_BE, unit quaternion.
+        quaternion_wxyz: (4,) unit quaternion of R_BE.
         flags: 0 or `CLUTCH_OPEN`.
         behind: age of the position that the displayed force answers [s]; 0 without a force.
     """
@@ -35,7 +35,7 @@ class DeviceState(NamedTuple):
     number: int
     t: float
     position: tuple[float, float, float]
-    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     flags: int = 0
     behind: float = 0.0
 
@@ -44,7 +44,7 @@ class DevicePose(NamedTuple):
     """Position p_BE [m], orientation R_BE [w, x, y, z] and flags of a `DeviceState`."""
 
     position: Sequence[float]
-    orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+    quaternion_wxyz: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
     flags: int = 0
 
 
@@ -57,7 +57,7 @@ class ForceCommand(NamedTuple):
 
 
 def pack_state(state: DeviceState) -> bytes:
-    numbers = (*state.position, *state.orientation, state.behind)
+    numbers = (*state.position, *state.quaternion_wxyz, state.behind)
     return _STATE_FORMAT.pack(_STATE_TAG, state.flags, state.number, state.t, *numbers)
 
 

@@ -136,8 +136,8 @@ class ExternalMaster(LeafSystem):
         path = [held, context.get_time(), *now, *motion]
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Do nothing: a real hand keeps its impedance."""
+    def KeepWrench(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+        """Do nothing: a real hand has its own impedance."""
 
     def _current_pose_and_twist(self, context: Context) -> Array:
         _pose_and_twist_on_path_into(

@@ -166,8 +166,8 @@ class LiveHand(Operator):
             _start_path_into(path, context.get_time(), now, target, _TRANSLATION_POLE_RAD_S)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Change the hand's impedance without a step of its wrench."""
+    def KeepWrench(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+        """Shift the intended motion so that the wrench has no step; the shift decays."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD_INDEX] < 0.5:
             return

@@ -110,7 +110,9 @@ class HaplyDevice:
         if message is None:
             return None
         self._device = message.device_name
-        return DevicePose(message.state.position, message.state.orientation, message.state.flags)
+        return DevicePose(
+            message.state.position, message.state.quaternion_wxyz, message.state.flags
+        )
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed

@@ -138,7 +138,7 @@ def _wrist_sensor_offset(scenario: Scenario) -> Array:
 
 def channel_fill_time_s(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
-    if scenario.has_direct_channel:
+    if scenario.has_no_network_or_passivity:
         return 0.0
     return (
         sum(longest_delay(line) for line in scenario.channel.networks_of_directions())

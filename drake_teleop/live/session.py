@@ -163,14 +163,14 @@ class _Station:
         impedances = other.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
             hand, context = self.block_and_context("live_hand")
-            hand.SetImpedance(context, *impedances)
+            hand.KeepWrench(context, *impedances)
         if not new_channel:
             return 0.0
-        name = "pose_command" if other.scenario.has_direct_channel else "pose_received"
+        name = "pose_command" if other.scenario.has_no_network_or_passivity else "pose_received"
         command = other.signal_value(name)
         scaling, context = self.block_and_context("kinematic_scaling")
         scaling.OpenClutch(context, command)
-        if not self.scenario.has_direct_channel:
+        if not self.scenario.has_no_network_or_passivity:
             channel, context = self.block_and_context("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))

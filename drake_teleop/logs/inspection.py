@@ -21,7 +21,7 @@ from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream_table
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_episodes
+from drake_teleop.logs.read.clocks import min_gap_length_s, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -266,7 +266,7 @@ def _inspect_clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
-    stamps, figures["episodes"] = time_stamps_and_episodes(time, table, at)
+    stamps, figures["episodes"] = time_stamps_and_num_episodes(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)
     usable[1:] &= stamps[1:] > highest[:-1]

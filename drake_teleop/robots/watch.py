@@ -22,8 +22,8 @@ from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.watched import (
     STATE_DISTURBED,
     STATE_OTHER_LOAD,
-    current_monitor_state,
     initial_monitor_memory,
+    load_state_index,
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
@@ -62,8 +62,8 @@ class ContactAndLoadMonitor:
             noise,
             np.zeros(9),
             dt,
-            model_error=LOAD_WRENCH_ERROR_FRACTION,
-            bound=_LOAD_REPLACEMENT_ACCURACY,
+            relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
+            mass_std_ratio=_LOAD_REPLACEMENT_ACCURACY,
         )
         self._phi = usable_phi(load)[0]
         self._covariance = limit_covariance(self._phi, load.covariance)
@@ -80,7 +80,7 @@ class ContactAndLoadMonitor:
     def reading_flags(self, values: Array) -> int:
         """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
         monitor_load(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
-        state = current_monitor_state(self._memory)
+        state = load_state_index(self._memory)
         if state == STATE_OTHER_LOAD:
             return int(ReadingFlag.OTHER_LOAD)
         return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0

@@ -42,7 +42,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
-    if scenario.has_direct_channel:
+    if scenario.has_no_network_or_passivity:
         wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]
         if scenario.contact_detection is not None:
             wires.append(("contact", "contact_at_hand", 1))

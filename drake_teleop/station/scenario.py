@@ -148,7 +148,7 @@ class Scenario:
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
-    def has_direct_channel(self) -> bool:
+    def has_no_network_or_passivity(self) -> bool:
         """True if no network and no passivity method are between master and slave."""
         return (
             self.passivity.method == "none"
@@ -313,7 +313,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
     if scenario.master.is_joint_leader and not (
-        scenario.has_direct_channel and scenario.contact_detection is None
+        scenario.has_no_network_or_passivity and scenario.contact_detection is None
     ):
         what = "a leader that commands joints requires a direct channel (a network transmits poses)"
         remedy = "set it to pose, or remove network, passivity and contact_detection"

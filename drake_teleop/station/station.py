@@ -67,7 +67,11 @@ def MakeTeleopStation(
     master = builder.AddNamedSystem("master_side", master or MakeMasterSide(scenario))
 
     sides = [master, slave]
-    if channel is None and scenario.has_direct_channel and scenario.contact_detection is None:
+    if (
+        channel is None
+        and scenario.has_no_network_or_passivity
+        and scenario.contact_detection is None
+    ):
         # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
         connect_ports(builder, master, setpoint, slave, setpoint)

@@ -148,7 +148,7 @@ def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):
     monkeypatch.setattr(study, "MakeTeleopStation", refuse)
     base = study.base_scenario("contact_transition", 0)
     row, shown = study.simulate_press(base, "tdpa", "lan", "stiff contact", np.zeros(16))
-    assert asked[0].sheet_spring.slip == Wall().slip
+    assert asked[0].sheet_spring.slip_speed == Wall().slip_speed
     assert (row["stable"], shown) == (False, {}) and "no" in row["error"]
 
 

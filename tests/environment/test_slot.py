@@ -55,7 +55,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     slot.PrepareContact(plant, scene_graph, tool.index())
     shapes = dict.fromkeys(plant.GetCollisionGeometriesForBody(tool), RigidTransform())
     inspector = scene_graph.model_inspector()
-    pairs = FindContactPairs(plant, inspector, shapes, environment, slot.slip).compiled_pairs
+    pairs = FindContactPairs(plant, inspector, shapes, environment, slot.slip_speed).compiled_pairs
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 

@@ -17,8 +17,8 @@ from drake_teleop.load.online.watched import (
     STATE_LEARNING,
     STATE_OTHER_LOAD,
     STATE_SETTLED,
-    current_monitor_state,
     initial_monitor_memory,
+    load_state_index,
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
@@ -203,7 +203,7 @@ def monitor_samples(prior, rows, fallback=None):
     rest = np.zeros(10) if fallback is None else fallback
     for k, row in enumerate(rows):
         monitor_load(out, memory, row, rest, 1e-3, *options)
-        handed[k], states[k] = out, current_monitor_state(memory)
+        handed[k], states[k] = out, load_state_index(memory)
     return handed, states
 
 

@@ -70,7 +70,9 @@ def test_client_sends_the_pose_and_displays_the_force(tmp_path):
         assert process.returncode == 0
     # HDAPI (10, 20, 30) mm: z is B's x, x its y, y its z. A rotation about up is one about B's z.
     np.testing.assert_allclose(state.position, [0.03, 0.01, 0.02], atol=1e-12)
-    np.testing.assert_allclose(state.orientation, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
+    np.testing.assert_allclose(
+        state.quaternion_wxyz, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12
+    )
     assert state.flags == CLUTCH_OPEN and 0.0 < state.behind < 1.0
     lines = [line.split() for line in output.splitlines() if line.startswith("force ")]
     assert {line[1] for line in lines} == {"1"}, "within a frame"

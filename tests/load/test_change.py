@@ -213,9 +213,9 @@ def test_errors_of_gain_and_cross_talk_are_no_change_if_stated(bench, tool):
         grasped, *also = bench.record("JR3", seed, "grasp")
         std = [np.repeat(x, 3) for x in bench.SENSORS["JR3"]]
         for error in alarms:
-            monitor = bench.Monitor(load, *std, 1e-3, model_error=error)
+            monitor = bench.Monitor(load, *std, 1e-3, relative_wrench_error=error)
             alarms[error] += int(monitor.watch(F @ gains.T, *measured).max() > KNOWN)
-        monitor = bench.Monitor(load, *std, 1e-3, model_error=0.01)
+        monitor = bench.Monitor(load, *std, 1e-3, relative_wrench_error=0.01)
         assert monitor.watch(grasped @ gains.T, *also)[-1] == IDENTIFIED
         assert monitor.load.mass - load.mass == pytest.approx(0.8, rel=0.03)
     assert alarms[0.01] == 0 < alarms[0.0]
@@ -292,8 +292,11 @@ def test_two_samples_per_block_detect_the_change(bench, tool):
     ("change", "words"),
     [
         ({"period": 0.0}, "period: has the value 0, which is not positive"),
-        ({"model_error": 1.0}, r"model_error: 1.0 is outside the range 0 <= model_error < 1"),
-        ({"bound": -1.0}, "bound: has the value -1, which is not positive"),
+        (
+            {"relative_wrench_error": 1.0},
+            r"relative_wrench_error: 1.0 is outside the range 0 <= relative_wrench_error < 1",
+        ),
+        ({"mass_std_ratio": -1.0}, "mass_std_ratio: has the value -1, which is not positive"),
         ({"wrench_std": np.zeros(6)}, "wrench_std: has the value 0, which is not positive"),
         ({"motion_std": np.zeros(6)}, "motion_std: has shape"),
         ({"offset_drift": np.full(6, np.nan)}, "offset_drift: is not finite"),

@@ -157,7 +157,7 @@ def test_log_in_one_call_equals_sample_by_sample():
 
 def test_settles_when_the_bound_is_reached():
     F, motion = noisy_record(3000)
-    estimators = [RecursiveLeastSquares(NOISE, bound=bound) for bound in (0.1, 0.05, 0.02)]
+    estimators = [RecursiveLeastSquares(NOISE, settled_std=x) for x in (0.1, 0.05, 0.02)]
     settled = []
     for estimator in estimators:
         assert not estimator.is_settled
@@ -200,8 +200,8 @@ def test_error_names_the_invalid_input_and_keeps_the_estimate():
         DrakeTeleopError, match=r"^forgetting: 1\.1 is outside the range 0 < forgetting <= 1"
     ):
         RecursiveLeastSquares(NOISE, forgetting=1.1)
-    with pytest.raises(DrakeTeleopError, match=r"^bound: -1\.0 is not positive"):
-        RecursiveLeastSquares(NOISE, bound=-1.0)
+    with pytest.raises(DrakeTeleopError, match=r"^settled_std: -1\.0 is not positive"):
+        RecursiveLeastSquares(NOISE, settled_std=-1.0)
     with pytest.raises(
         DrakeTeleopError, match=r"^noise_std: has the value -.*, which is not positive"
     ):

@@ -109,7 +109,7 @@ def test_common_scale_of_the_noise_is_estimated():
 def test_after_one_and_a_half_seconds_the_load_is_settled():
     F, motion = record(1, samples=20_000)
     motion = [np.ascontiguousarray(x[::2]) for x in motion]  # any rate; a slow motion
-    estimator = RecursiveTotalLeastSquares(NOISE, MOTION, bound=0.02)
+    estimator = RecursiveTotalLeastSquares(NOISE, MOTION, settled_std=0.02)
     estimator.update_samples(F[:40], *(x[:40] for x in motion))
     assert not estimator.is_settled
     F, motion = record(2)
@@ -233,7 +233,7 @@ def test_error_names_the_invalid_input():
         RecursiveTotalLeastSquares(NOISE, -MOTION)
     with pytest.raises(DrakeTeleopError, match=r"^motion_std: has shape \(6,\)"):
         RecursiveTotalLeastSquares(NOISE, NOISE)
-    with pytest.raises(DrakeTeleopError, match=r"^bound: 0\.0 is not positive"):
-        RecursiveTotalLeastSquares(NOISE, MOTION, bound=0.0)
+    with pytest.raises(DrakeTeleopError, match=r"^settled_std: 0\.0 is not positive"):
+        RecursiveTotalLeastSquares(NOISE, MOTION, settled_std=0.0)
     with pytest.raises(DrakeTeleopError, match="estimator: has not received a sample"):
         RecursiveTotalLeastSquares(NOISE, MOTION).identification()

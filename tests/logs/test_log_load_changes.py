@@ -92,7 +92,9 @@ def test_only_an_added_load_is_found(ntnu: Path, tmp_path: Path, record: str) ->
     theta = np.concatenate([known.offsets, known.phi])
 
     def states(wrench: np.ndarray) -> np.ndarray:
-        parameters = change_detector_parameters(noise, motion_std, log.dt, model_error=0.02)
+        parameters = change_detector_parameters(
+            noise, motion_std, log.dt, relative_wrench_error=0.02
+        )
         memory = initial_change_memory(theta, known.covariance, drift)
         return detector_states_of_log(memory, parameters, wrench, *log.motion)
 

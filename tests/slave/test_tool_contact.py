@@ -33,7 +33,7 @@ def drake_wrench(plant, context, tool) -> np.ndarray:
     ("leaf", "most"),
     [
         (SheetSpring(position=[0.55, 0.0, 0.158]), 0.02),
-        (SheetSpring(position=[0.575, 0.028, 0.155], slip=2e-3), 0.04),
+        (SheetSpring(position=[0.575, 0.028, 0.155], slip_speed=2e-3), 0.04),
     ],
     ids=["face", "edge"],
 )

@@ -77,7 +77,7 @@ class Linearization:
             raise DrakeTeleopError(
                 f"{size} states, most of them for the delay, are too many (maximum {MAX_STATES})",
                 where="channel.delay",
-                remedy="shorten the delay, or count unstable multipliers of one axis (cut_loop)",
+                remedy="shorten it, or call count_unstable_multipliers(cut_loop(axis, ...), delay)",
             )
         else:
             values = _find_eigenvalues_near_circle(

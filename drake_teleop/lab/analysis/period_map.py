@@ -234,7 +234,7 @@ class _PeriodMapRows:
 def mass_spring_motion(
     stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """Return (x, x') after `time` of x'' = u - b x' - k x, from x = 1, x' = 1, and for u = 1."""
+    """Return (x, x') of x'' = u - b x' - k x after `time`: of x = 1, of x' = 1, and of u = 1."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t

@@ -58,7 +58,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(AxisParameters):
-    """Parameters with Coulomb friction, no device damping, and lag, encoders, noise, model errors.
+    """Parameters with Coulomb friction, motor lag, encoders, noise, errors; no device damping.
 
     The equations of motion are::
 

@@ -152,7 +152,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 @njit(cache=True)
 def _exact_and_smooth_maximum(use, sharpness):
-    """Return exact and smooth maximum of `use` (T, m); replace `use` by the gradient."""
+    """Return the maximum over all `use` (T, m), exact and smooth; `use` becomes its gradient."""
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):

@@ -115,30 +115,32 @@ class DesignProblem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        joints, g, criterion = self._evaluate_motion(x), self._gradients, self.task.criterion
+        q_qd_qdd, g, criterion = self._evaluate_motion(x), self._gradients, self.task.criterion
         g[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        criterion_gradient(self.task.arm_table, self._motions, *joints[1:], g_V, g[0])
-        smooth, largest = self._limit_uses(joints, limit_sharpness, g[1:])
+        criterion_gradient(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0])
+        smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[1:])
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
     def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
         """Return q, qd, qdd (3, T, n) of a motion, and write the motions of links and sensor."""
         n = len(self.task.home_posture)
-        joints: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
-        joints[0] += x[:n]
-        joints[1] /= slowdown
-        joints[2] /= slowdown**2
-        write_link_motions(self.task.arm_table, *joints, self._motions)
+        q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
+        q_qd_qdd[0] += x[:n]
+        q_qd_qdd[1] /= slowdown
+        q_qd_qdd[2] /= slowdown**2
+        write_link_motions(self.task.arm_table, *q_qd_qdd, self._motions)
         write_sensor_motion(self._motions, self._vectors)
-        return joints
+        return q_qd_qdd
 
-    def _limit_uses(self, joints: Array, sharpness: float, gradients: Array) -> tuple[Array, float]:
+    def _limit_uses(
+        self, q_qd_qdd: Array, sharpness: float, gradients: Array
+    ) -> tuple[Array, float]:
         """Return smooth uses (7,) and the exact largest one; write the gradients (7, 3, T, n)."""
         smooth, largest = np.empty((2, len(LIMIT_NAMES)))
         write_limit_uses(
-            self.task.arm_table, *joints, self._motions, self.task.limits, sharpness,
+            self.task.arm_table, *q_qd_qdd, self._motions, self.task.limits, sharpness,
             smooth, largest, gradients,
         )  # fmt: skip
         return smooth, float(largest.max())

@@ -214,14 +214,14 @@ class ShortestMotionProblem(DesignProblem):
         self._at = x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
-        joints, g = self._evaluate_motion(x[:-1], T), self._gradients
+        q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._largest_error_over_tolerance(
             _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         )
-        criterion_gradient(self.task.arm_table, self._motions, *joints[1:], g_V, g[1])
-        smooth, largest = self._limit_uses(joints, limit_sharpness, g[2:])
-        by_log_period = -(g[:, 1] * joints[1] + 2.0 * g[:, 2] * joints[2]).sum(axis=(1, 2))
+        criterion_gradient(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
+        smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
+        by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
         by_log_period[1] -= 0.25
         by_log_period[0] = 1.0

@@ -124,7 +124,7 @@ class TrialWalls(Environment):
     """Walls of each size in `WALL_EDGES_M` that can be moved below the tool."""
 
     @property
-    def slip(self) -> float:
+    def slip_speed(self) -> float:
         return 1e-3
 
     def AddTo(self, plant: MultibodyPlant) -> None:

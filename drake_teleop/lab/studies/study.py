@@ -91,8 +91,8 @@ def study_command(
     ):
         if both:
             raise DrakeTeleopError(
-                f"{first} and {second} cannot be combined",
-                where=str(path),
+                f"the options {first} and {second} cannot be combined",
+                where="study",
                 remedy="remove one of them",
             )
     study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())

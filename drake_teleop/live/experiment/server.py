@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment
 from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
-from drake_teleop.live.experiment.simulated import make_all_apparatus
+from drake_teleop.live.experiment.simulated import make_apparatus_by_task_and_condition
 from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
@@ -34,7 +34,7 @@ class ExperimentDrive(LiveDrive):
     ) -> None:
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
-        self._stations = make_all_apparatus(experiment, scenarios)
+        self._stations = make_apparatus_by_task_and_condition(experiment, scenarios)
         self.procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)

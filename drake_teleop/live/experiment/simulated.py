@@ -41,7 +41,7 @@ _HAND_MOTION_START_S = 0.4
 _LOG_READ_PERIOD_MS = 200
 
 
-def make_all_apparatus(
+def make_apparatus_by_task_and_condition(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}

@@ -175,17 +175,19 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
-def covariance_for_white_noise(plain: Array, equations: SecondMoments, fit: EstimatorFit) -> Array:
+def covariance_for_white_noise(
+    least_squares_covariance: Array, equations: SecondMoments, fit: EstimatorFit
+) -> Array:
     """Return the covariance (16, 16) of a fit, for noise correlated between channels only."""
     W, Z = fit.form.weights, fit.moments.mean_products
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
-        return plain
+        return least_squares_covariance
     scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
     covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
-    return mark_undetermined(covariance, np.isinf(np.diag(plain)))
+    return mark_undetermined(covariance, np.isinf(np.diag(least_squares_covariance)))
 
 
 def _inverse_gram(fit: EstimatorFit) -> Array:
@@ -244,11 +246,13 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
     return np.asarray(effects @ effects.T)
 
 
-def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of the solution `form`, from `plain` of least squares."""
-    unknown = np.isinf(np.diag(plain))
-    covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
-    if not offsets:  # covariance for known offsets
+def covariance_of_solution(
+    least_squares_covariance: Array, form: NormalForm, offsets_estimated: bool
+) -> Array:
+    """Return the covariance (16, 16) of the solution of `form`."""
+    unknown = np.isinf(np.diag(least_squares_covariance))
+    covariance = np.where(unknown[:, None] | unknown, 0.0, least_squares_covariance)
+    if not offsets_estimated:
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0

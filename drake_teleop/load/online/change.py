@@ -40,7 +40,7 @@ MIN_NEW_LOAD_AGE_S, MODEL_ERROR_PERSISTENCE_S = 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
 MAX_MASS_STD_OVER_CHANGE = 0.0025
-"""Default of `bound`: four standard deviations are 1 % of the change of mass."""
+"""Default of `mass_std_ratio`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT_STD = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
 
@@ -50,7 +50,7 @@ OBJECT_PRIOR_STD = PRIOR_STD[6:]
 # the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
 # blocks of noise reach the return limit.
 _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
-# Factor of the bound for first moments relative to that of the mass, and smallest size [m].
+# Factor of this limit for first moments relative to that of the mass, and smallest size [m].
 _FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
 _MAX_NEGATIVE_MASS_OVER_STD = 4.0
@@ -153,25 +153,25 @@ def _update_filter(memory, place, block, noise):
 
 
 @njit(cache=True)
-def _restart_filter(memory, place):
-    copy_into(memory, place, memory, _KNOWN_LOAD_START, 272)
-    if place == _NEW_FILTER_START:
+def _restart_filter_from_known_load(memory, filter_start):
+    copy_into(memory, filter_start, memory, _KNOWN_LOAD_START, 272)
+    if filter_start == _NEW_FILTER_START:
         for j in range(10):
-            memory[place + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
+            memory[filter_start + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
         memory[_NEW_LOAD_START_INDEX] = memory[_SAMPLE_COUNT_INDEX]
         memory[_NEW_RESIDUAL_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
     memory[_CUSUM_INDEX] = memory[_ESTIMATE_AGE_INDEX] = 0.0
 
 
 @njit(cache=True)
-def _is_identified(memory, bound):
+def _is_identified(memory, mass_std_ratio):
     theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
     P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
-    moment = bound * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
+    moment = mass_std_ratio * change * max(size, _MIN_LOAD_SIZE_M) * _FIRST_MOMENT_BOUND_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
-    return math.sqrt(P[6, 6]) <= bound * change and math.sqrt(largest) <= moment
+    return math.sqrt(P[6, 6]) <= mass_std_ratio * change and math.sqrt(largest) <= moment
 
 
 @njit(cache=True)
@@ -187,7 +187,7 @@ def _inflate_inertia_variances(memory, noise, block):
 
 
 @njit(cache=True)
-def update_change_detector(memory, sample, block, noise, window, hold, bound):
+def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
     """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
     motion = sample[SAMPLE_MOTION]
@@ -202,24 +202,24 @@ def update_change_detector(memory, sample, block, noise, window, hold, bound):
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
     if memory[_BLOCK_SAMPLES_INDEX] >= block:
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] /= block
-        _test_block_for_change(memory, block, noise, window, hold, bound)
+        _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio)
         memory[_WRENCH_SUM_START:_KNOWN_LOAD_START] = 0.0
         memory[_BLOCK_SAMPLES_INDEX] = 0.0
 
 
 @njit(cache=True)
-def _test_block_for_change(memory, block, noise, window, hold, bound):
+def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
     if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]:
         if memory[_ESTIMATE_AGE_INDEX] >= window:
             excess = memory[_CUSUM_INDEX]
-            _restart_filter(memory, _MONITOR_FILTER_START)
+            _restart_filter_from_known_load(memory, _MONITOR_FILTER_START)
             memory[_CUSUM_INDEX] = excess
         memory[_ESTIMATE_AGE_INDEX] += 1.0
         chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
         memory[_CUSUM_INDEX] = max(0.0, memory[_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
         if memory[_CUSUM_INDEX] > _ALARM_CUSUM:
             memory[_STATE_INDEX], memory[_RETURN_CUSUM_INDEX] = STATE_DISTURBED, 0.0
-            _restart_filter(memory, _NEW_FILTER_START)
+            _restart_filter_from_known_load(memory, _NEW_FILTER_START)
         return
     # Return to the known load if it explains the blocks without an update.
     copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_LOAD_START, 272)
@@ -227,7 +227,7 @@ def _test_block_for_change(memory, block, noise, window, hold, bound):
     memory[_RETURN_CUSUM_INDEX] = min(0.0, memory[_RETURN_CUSUM_INDEX] + chi - _CHI_SQUARED_SLACK)
     if memory[_RETURN_CUSUM_INDEX] < _RETURN_TO_KNOWN_CUSUM:
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX]
-        _restart_filter(memory, _MONITOR_FILTER_START)
+        _restart_filter_from_known_load(memory, _MONITOR_FILTER_START)
         return
     # Test whether one new load explains all blocks since its start.
     chi = _update_filter(memory, _NEW_FILTER_START, block, noise)
@@ -246,10 +246,10 @@ def _test_block_for_change(memory, block, noise, window, hold, bound):
     deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
     if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_NEGATIVE_MASS_OVER_STD * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
-        _restart_filter(memory, _NEW_FILTER_START)
+        _restart_filter_from_known_load(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
         memory[_STATE_INDEX] = STATE_CHANGED
-    elif memory[_STATE_INDEX] == STATE_CHANGED and _is_identified(memory, bound):
+    elif memory[_STATE_INDEX] == STATE_CHANGED and _is_identified(memory, mass_std_ratio):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
         _inflate_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
@@ -258,13 +258,13 @@ def _test_block_for_change(memory, block, noise, window, hold, bound):
         for i in range(6):
             squares = memory[_NEW_RESIDUAL_SQUARES_START + i]
             memory[_KNOWN_RESIDUAL_SQUARES_START + i] = squares * share
-        _restart_filter(memory, _MONITOR_FILTER_START)
+        _restart_filter_from_known_load(memory, _MONITOR_FILTER_START)
 
 
 @njit(cache=True)
-def _process_samples_of_log(memory, samples, states, block, noise, window, hold, bound):
+def _process_samples_of_log(memory, samples, states, block, noise, window, hold, mass_std_ratio):
     for k in range(samples.shape[0]):
-        update_change_detector(memory, samples[k], block, noise, window, hold, bound)
+        update_change_detector(memory, samples[k], block, noise, window, hold, mass_std_ratio)
         states[k] = int(memory[_STATE_INDEX])
 
 
@@ -276,33 +276,33 @@ def change_detector_parameters(
     motion_std: ArrayLike,
     period: float,
     *,
-    model_error: float = 0.0,
-    bound: float | None = None,
+    relative_wrench_error: float = 0.0,
+    mass_std_ratio: float | None = None,
 ) -> DetectorParameters:
     """Return the parameters of the change detector.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
         period: time between samples [s].
-        model_error: relative error of the load's wrench.
-        bound: required standard deviation of a new load's mass, relative to the change of mass.
+        relative_wrench_error: relative error of the load's wrench.
+        mass_std_ratio: required standard deviation of a new load's mass, over the change.
     """
     positive_array("period", period)
-    if not 0.0 <= model_error < 1.0:
-        what = f"{model_error} is outside the range 0 <= model_error < 1"
+    if not 0.0 <= relative_wrench_error < 1.0:
+        what = f"{relative_wrench_error} is outside the range 0 <= relative_wrench_error < 1"
         remedy = "give the relative error of the model"
-        raise DrakeTeleopError(what, where="model_error", remedy=remedy)
-    if bound is None:
-        bound = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * model_error)
-    positive_array("bound", bound)
+        raise DrakeTeleopError(what, where="relative_wrench_error", remedy=remedy)
+    if mass_std_ratio is None:
+        mass_std_ratio = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * relative_wrench_error)
+    positive_array("mass_std_ratio", mass_std_ratio)
     block = max(1, round(DETECTOR_BLOCK_DURATION_S / period))
     window, hold, memory = (
         max(1, round(x / (block * period)))
         for x in (FILTER_RESTART_INTERVAL_S, MIN_NEW_LOAD_AGE_S, MODEL_ERROR_PERSISTENCE_S)
     )
     std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
-    noise = np.concatenate([*std, [model_error]]) ** 2
-    return block, np.append(noise, memory), window, hold, float(bound)
+    noise = np.concatenate([*std, [relative_wrench_error]]) ** 2
+    return block, np.append(noise, memory), window, hold, float(mass_std_ratio)
 
 
 def initial_change_memory(

@@ -24,7 +24,7 @@ PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
 
 MAX_SETTLED_RELATIVE_STD = 0.05
-"""Default of `bound`, relative to the natural scale."""
+"""Default of `settled_std`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
 _MIN_RELATIVE_INFORMATION_EIGENVALUE = 1e-16
@@ -90,7 +90,7 @@ class RecursiveEstimator(ABC):
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
-        bound: standard deviation that `is_settled` requires, relative to `natural_scales`.
+        settled_std: standard deviation that `is_settled` requires, relative to `natural_scales`.
     """
 
     #: Value of `Identification.method`.
@@ -103,27 +103,26 @@ class RecursiveEstimator(ABC):
         noise_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = MAX_SETTLED_RELATIVE_STD,
+        settled_std: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             what = f"{forgetting} is outside the range 0 < forgetting <= 1"
             raise DrakeTeleopError(what, where="forgetting", remedy="give 1 for no forgetting")
-        if not bound > 0.0:
-            raise DrakeTeleopError(
-                f"{bound} is not positive", where="bound", remedy="give a number above 0"
-            )
+        if not settled_std > 0.0:
+            what = f"{settled_std} is not positive"
+            raise DrakeTeleopError(what, where="settled_std", remedy="give a number above 0")
         self._noise_std = positive_array("noise_std", noise_std, 6)
-        self._forgetting, self._bound = float(forgetting), float(bound)
+        self._forgetting, self._settled_std = float(forgetting), float(settled_std)
         self._prior = positive_array("prior_std", prior_std, 16) ** 2
         self._theta, self._samples = np.zeros(16), 0
         self._memory = self.initial_memory(self._theta)
 
     @classmethod
     def for_noise(
-        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
+        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, settled_std: float
     ) -> RecursiveEstimator:
         """Return an estimator for standard deviations of wrench (6,) and [s, omega, alpha] (9,)."""
-        return cls(noise_std, forgetting=forgetting, bound=bound)
+        return cls(noise_std, forgetting=forgetting, settled_std=settled_std)
 
     @property
     def phi(self) -> Array:
@@ -139,14 +138,14 @@ class RecursiveEstimator(ABC):
 
     @property
     def is_settled(self) -> bool:
-        """Whether data, not the prior, determine all parameters within `bound`."""
+        """Whether data, not the prior, determine all parameters within `settled_std`."""
         return self.is_state_settled(self._theta, self._memory)
 
     def is_state_settled(self, theta: Array, memory: Array) -> bool:
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
-        return bool(self._are_certain(deviations, theta, self._bound).all())
+        return bool(self._are_certain(deviations, theta, self._settled_std).all())
 
     @abstractmethod
     def initial_memory(self, theta: Array) -> Array: ...
@@ -212,10 +211,10 @@ class RecursiveEstimator(ABC):
             prior_dominated=is_prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
-    def _are_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
+    def _are_certain(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
         certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return certain & is_precise_enough(
-            deviations * (MAX_IDENTIFIED_STD_SHARE / bound), theta[6:]
+            deviations * (MAX_IDENTIFIED_STD_SHARE / max_std), theta[6:]
         )
 
     def _condition_number(self) -> float:

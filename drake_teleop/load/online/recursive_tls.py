@@ -329,16 +329,16 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         motion_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = MAX_SETTLED_RELATIVE_STD,
+        settled_std: float = MAX_SETTLED_RELATIVE_STD,
     ) -> None:
         self._motion_std = nonnegative_array("motion_std", motion_std, 9)
-        super().__init__(noise_std, forgetting, prior_std, bound)
+        super().__init__(noise_std, forgetting, prior_std, settled_std)
 
     @classmethod
     def for_noise(
-        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
+        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, settled_std: float
     ) -> RecursiveTotalLeastSquares:
-        return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
+        return cls(noise_std, motion_std, forgetting=forgetting, settled_std=settled_std)
 
     @property
     def noise_scale(self) -> float:

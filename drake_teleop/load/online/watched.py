@@ -68,7 +68,7 @@ def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
 
 
 @njit(cache=True)
-def current_monitor_state(memory):
+def load_state_index(memory):
     """Return the index into `LOAD_STATE_NAMES`; `STATE_LEARNING` for a memory of zeros."""
     return int(memory[_STATE_INDEX])
 
@@ -115,14 +115,14 @@ def _is_com_within_reach(known, new):
 
 
 @njit(cache=True)
-def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, bound):
+def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, mass_std_ratio):
     """Process one sample: monitor the known load and write the load to eliminate into `out` (16,).
 
     `fallback` (10,) is the phi for a changed load; the last arguments are from
     `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
-    update_change_detector(watch, sample, block, noise, window, hold, bound)
+    update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
     known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
     wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)

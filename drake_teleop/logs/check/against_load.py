@@ -70,11 +70,11 @@ class LoadFit:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < self.limit_beyond_noise(GOOD_UNEXPLAINED)
+        return self.mass > 0 and self.unexplained < self.max_unexplained_share(GOOD_UNEXPLAINED)
 
-    def limit_beyond_noise(self, share: float) -> float:
-        """Return the largest unexplained share for a `share` [of the variance] beside noise."""
-        return min(share + self.noise_share, UNDETERMINED_UNEXPLAINED_SHARE)
+    def max_unexplained_share(self, share_beside_noise: float) -> float:
+        """Return the largest accepted `unexplained`: that of the noise plus the given share."""
+        return min(share_beside_noise + self.noise_share, UNDETERMINED_UNEXPLAINED_SHARE)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
@@ -209,7 +209,7 @@ def _edits_with_far_better_fit(
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.limit_beyond_noise(VALID_UNEXPLAINED)
+    valid = given.max_unexplained_share(VALID_UNEXPLAINED)
     decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]

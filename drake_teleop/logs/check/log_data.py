@@ -17,7 +17,7 @@ from drake_teleop.logs.check.corrections import Finding, edit_field
 from drake_teleop.logs.read.alignment import white_noise_deviations
 from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_episodes
+from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
@@ -42,8 +42,8 @@ class LogData:
         for name, stream in description.streams.items():
             whole = tables[stream.source]
             copied = replace(whole, columns=dict(whole.columns))
-            thin = self._thinned.setdefault(stream.source, copied)
-            self._add_thinned_columns(name, stream, thin, min(steps[stream.source]))
+            thinned = self._thinned.setdefault(stream.source, copied)
+            self._add_thinned_columns(name, stream, thinned, min(steps[stream.source]))
 
     def read_whole_log(self, description: Description) -> Log:
         return read_description(description, self._source, tables=self.tables)
@@ -101,31 +101,35 @@ class LogData:
         if stream.time.column is None:
             rows = np.arange(self._table_of_stream(stream).rows)
             return rows / stream.time.rate, rows
-        t, _ = time_stamps_and_episodes(stream.time, self._table_of_stream(stream), "time")
+        t, _ = time_stamps_and_num_episodes(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
         return (spread_shared_stamps(t) if shared else t), rows
 
-    def _add_thinned_columns(self, name: str, stream: Any, thin: Table, k: int) -> None:
+    def _add_thinned_columns(self, name: str, stream: Any, thinned: Table, block_rows: int) -> None:
         table, rows = self._table_of_stream(stream), None
         if getattr(stream, "time", None) is not None:
             t, rows = self._times_and_rows(stream)
-            thin.columns[f"{_THIN_TIME_PREFIX} {name}"] = _means_of_consecutive_rows(t[:, None], k)
+            means = _means_of_consecutive_rows(t[:, None], block_rows)
+            thinned.columns[f"{_THIN_TIME_PREFIX} {name}"] = means
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
                 x = table.numbers_with_nan(column, field)
                 x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
-                taken = x[k // 2 :: k][: len(x) // k]
-                mean = field != "orientation"
-                thin.columns[column] = _means_of_consecutive_rows(x, k) if mean else taken
+                if field == "orientation":
+                    x = x[block_rows // 2 :: block_rows][: len(x) // block_rows]
+                else:
+                    x = _means_of_consecutive_rows(x, block_rows)
+                thinned.columns[column] = x
 
 
-def _means_of_consecutive_rows(x: Array, k: int) -> Array:
-    rows = len(x) // k
-    return x[: rows * k].reshape(rows, k, -1).mean(axis=1) if k > 1 else x
+def _means_of_consecutive_rows(x: Array, block_rows: int) -> Array:
+    rows = len(x) // block_rows
+    blocks = x[: rows * block_rows].reshape(rows, block_rows, -1)
+    return blocks.mean(axis=1) if block_rows > 1 else x
 
 
 _CHECKED_FIELDS_OF_STREAM = {

@@ -155,12 +155,12 @@ def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Spectra of wrench (K, 6) and motion signals (K, 16) of a record, for one taper and delay.
+    """Spectra of wrench (K, 6) and 16 motion signals (K, 16) at K frequencies of a record.
 
     Attributes:
         grid, taper: instants of the record, and their weights (M,).
         delay: delay of the signals [s].
-        motion_signals: (M, 16) signals zeta over time.
+        motion_signals: (M, 16) signals over time, see `PoseSplines.signals`.
     """
 
     bands: FrequencyBands

@@ -61,7 +61,7 @@ class ImuData:
 
     @property
     def rate(self) -> float:
-        """Rate outside of gaps [Hz]."""
+        """Median rate [Hz]."""
         return float(1.0 / np.median(np.diff(self.t)))
 
     def average_to_rate(self, fastest: float) -> ImuData:

@@ -59,7 +59,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         assert time.rate is not None
         rows = np.arange(table.rows)
         return Clock(_apply_clock_scale_and_offset(rows / time.rate, time), rows, table.rows)
-    t, episodes = time_stamps_and_episodes(time, table, where)
+    t, episodes = time_stamps_and_num_episodes(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
@@ -89,7 +89,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     return Clock(_apply_clock_scale_and_offset(t, time), rows, total, tuple(notes), episodes)
 
 
-def time_stamps_and_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
+def time_stamps_and_num_episodes(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock.

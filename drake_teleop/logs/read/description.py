@@ -361,7 +361,7 @@ def load_description(path: str | Path) -> Description:
     """Read a log description; its paths are relative to its folder."""
     path = Path(path)
     if not os.path.exists(path):
-        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+        raise DrakeTeleopError("no such log description", where=str(path), remedy="check the path")
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise DrakeTeleopError(

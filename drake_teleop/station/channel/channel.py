@@ -252,7 +252,7 @@ def step_slave_end(
 
 @njit(cache=True)
 def _pose_increment_into(pose, before, dx):
-    """Write the change `dx` (6,) since the last finite pose; return whether `pose` is finite."""
+    """Write the change `dx` (6,) since the last pose, 0 without two finite ones; return finite."""
     valid = all_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)

@@ -39,7 +39,7 @@ class Environment(ABC):
 
     @property
     @abstractmethod
-    def slip(self) -> float:
+    def slip_speed(self) -> float:
         """Sliding speed of full friction [m/s]; the smallest of all objects applies to all."""
 
     @abstractmethod
@@ -89,8 +89,8 @@ class SeveralObjects(Environment):
         return self._parts
 
     @property
-    def slip(self) -> float:
-        return min(part.slip for part in self._parts)
+    def slip_speed(self) -> float:
+        return min(part.slip_speed for part in self._parts)
 
     @property
     def hydroelastic(self) -> bool:

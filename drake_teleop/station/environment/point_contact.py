@@ -64,14 +64,14 @@ def FindContactPairs(
     inspector: SceneGraphInspector,
     tool: Mapping[GeometryId, RigidTransform],
     environment: Iterable[ModelInstanceIndex],
-    slip: float,
+    slip_speed: float,
     moving: Sequence[int] = (),
 ) -> ShapePairs:
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
         tool: pose X_SBody of its body, for each shape of the tool.
-        slip: sliding speed of full friction [m/s], the plant's stiction tolerance.
+        slip_speed: sliding speed of full friction [m/s], the plant's stiction tolerance.
         moving: body index of each row of a joint table (`MakeJointTable`).
 
     Raises:
@@ -100,7 +100,7 @@ def FindContactPairs(
                     half = np.array(edges.size()) / 2
                     place = [X_SShape.translation(), [sphere.radius()]]
                     compiled_pairs.append(
-                        _pair_row(place, X_Other, half, [direction, law, [slip, row]])
+                        _pair_row(place, X_Other, half, [direction, law, [slip_speed, row]])
                     )
                 except DrakeTeleopError as beyond:
                     monitoring_reason = monitoring_reason or str(beyond)
@@ -108,7 +108,7 @@ def FindContactPairs(
                     X_SBox, X_Other = X_SShape @ own_box.pose(), X_Other @ box.pose()
                     place = [X_SBox.translation(), [0.0]]
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
-                    last = [direction, [0.0] * 4, [slip, row], *turned]
+                    last = [direction, [0.0] * 4, [slip_speed, row], *turned]
                     monitored_pairs.append(_pair_row(place, X_Other, box.half_width(), last))
     return ShapePairs(
         np.array(compiled_pairs).reshape(len(compiled_pairs), NUM_PAIR_COLUMNS),
@@ -253,11 +253,11 @@ def min_distance_of_boxes(
 
 
 @njit(cache=True)
-def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
-    if slip < 1.0:
-        return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
-    if slip < 3.0:
-        u = (slip - 1.0) / 2.0
+def _friction_coefficient(static: float, dynamic: float, slip_ratio: float) -> float:
+    if slip_ratio < 1.0:
+        return static * slip_ratio**3 * (10.0 + slip_ratio * (6.0 * slip_ratio - 15.0))
+    if slip_ratio < 3.0:
+        u = (slip_ratio - 1.0) / 2.0
         return static - (static - dynamic) * u**3 * (10.0 + u * (6.0 * u - 15.0))
     return dynamic
 

@@ -38,7 +38,7 @@ class SheetSpring(Environment):
     damping_ratio: float = quantity(
         0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 it creeps back"
     )
-    slip: float = quantity(1e-4, "m/s", 1e-6, 1.0, "slip speed of fully developed friction (E)")
+    slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
     def stiffness(self) -> float:

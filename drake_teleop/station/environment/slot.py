@@ -60,7 +60,7 @@ class Slot(Environment):
         return 2 * PEG_RADIUS_M + self.clearance
 
     @property
-    def slip(self) -> float:
+    def slip_speed(self) -> float:
         return 1e-3
 
     @property

@@ -49,7 +49,7 @@ class Surface(Environment):
     )
 
     @property
-    def slip(self) -> float:
+    def slip_speed(self) -> float:
         return 1e-3
 
     def material(self) -> ProximityProperties:

@@ -18,8 +18,8 @@ from drake_teleop.load.online.watched import (
     MEMORY_SIZE,
     STATE_LEARNING,
     STATE_SETTLED,
-    current_monitor_state,
     initial_monitor_memory,
+    load_state_index,
     monitor_load,
 )
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
@@ -43,7 +43,7 @@ class LoadEstimatorConfig:
         0.05, "1", 1e-6, 10.0, "predicted uncertainty of a settled load relative to a natural value"
     )
     watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
-    model_error: float = quantity(
+    relative_wrench_error: float = quantity(
         0.0, "1", 0.0, 0.5, "watch: error of the wrench by gains, cross-talk and delays, as a share"
     )
 
@@ -97,7 +97,7 @@ class LoadEstimator(LeafSystem):
             remedy = "set load_estimator.enabled, or pass load_estimate with load_covariance"
             raise DrakeTeleopError(what, where="load_estimator.watch", remedy=remedy)
         self._estimator = METHODS[config.method].for_noise(
-            noise_std, motion_std, forgetting=config.forgetting, bound=config.settled_bound
+            noise_std, motion_std, forgetting=config.forgetting, settled_std=config.settled_bound
         )
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
@@ -115,7 +115,7 @@ class LoadEstimator(LeafSystem):
                 unknown if covariance is None else initial_monitor_memory(start, covariance)
             )
             change = change_detector_parameters(
-                noise_std, motion_std, period, model_error=config.model_error
+                noise_std, motion_std, period, relative_wrench_error=config.relative_wrench_error
             )
             self._watch_arguments = (
                 np.zeros(10) if fallback is None else np.array(fallback, dtype=float),
@@ -152,7 +152,7 @@ class LoadEstimator(LeafSystem):
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
-        return current_monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
+        return load_state_index(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
     def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()

@@ -271,7 +271,7 @@ class Operator(LeafSystem):
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
         - intent: (7,) the intended X_BE
         - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
-          the rendered force [N], trust (with a task)
+          the rendered force [N], trust in detecting contact, 0.1 to 1 (with a task)
 
     The intended motion is relative to the pose X_BE `start` (7,). A task requires training, the
     slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].

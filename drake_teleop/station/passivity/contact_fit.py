@@ -35,23 +35,23 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 
 
 @njit(cache=True)
-def force_without_slip_steps(displayed, component, explained, share, max_slip):
+def force_without_slip_steps(displayed, component, explained, share, max_change):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
     `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
     `explained` by depth and speed is rendered at once. The remaining difference, at most
-    `max_slip`, is reduced by `share`.
+    `max_change`, is reduced by `share`.
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)
-    return min(max(displayed, component - max_slip, 0.0), component + max_slip)
+    return min(max(displayed, component - max_change, 0.0), component + max_change)
 
 
 @njit(cache=True)
-def force_change_by_slip(force_change, largest_change, max_slip):
-    """Return the part of a force change [N] that slip may cause, at most `max_slip`.
+def force_change_by_slip(force_change, largest_change, max_change):
+    """Return the part of a force change [N] that slip may cause, at most `max_change`.
 
     `largest_change` [N] is the change that the largest stiffness would cause.
     """
     rest = force_change - min(max(force_change, min(largest_change, 0.0)), max(largest_change, 0.0))
-    return min(max(rest, -max_slip), max_slip)
+    return min(max(rest, -max_change), max_change)

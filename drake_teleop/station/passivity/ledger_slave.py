@@ -310,7 +310,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
-    max_slip = _max_slip_force_change(wrench, size, T, p, memory)
+    max_change = _max_force_change_by_slip(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
@@ -335,7 +335,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
         change = memory[_FILTERED_FORCE] - memory[_FIT_SAMPLE_START_FORCE] - damping * speed_change
         change -= force_change_by_slip(
-            change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip
+            change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_change
         )
         change += damping * speed_change
         k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
@@ -360,7 +360,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     explained = memory[_CONTACT_STIFFNESS] * inward
     explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED_INTO_WALL])
     rate = T / _SLIP_FORCE_FADE_S + abs(inward) / _MIN_FIT_SPAN_M
-    shown = force_without_slip_steps(memory[_RENDERED_FORCE], size, explained, rate, max_slip)
+    shown = force_without_slip_steps(memory[_RENDERED_FORCE], size, explained, rate, max_change)
     memory[_RENDERED_FORCE] = shown
     memory[_LAST_SPEED_INTO_WALL] = speed
 
@@ -375,10 +375,10 @@ def _is_wall_removed(dx, memory):
 
 
 @njit(cache=True)
-def _max_slip_force_change(wrench, size, T, p, memory):
+def _max_force_change_by_slip(wrench, normal_force, T, p, memory):
     mean_wrench = memory[MEAN_CONTACT_WRENCH]
     mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
-    friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - size * size, 0.0))
+    friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - normal_force**2, 0.0))
     largest = max(memory[_MAX_FRICTION_FORCE] * (1.0 - min(T / _FRICTION_DECAY_S, 1.0)), friction)
     memory[_MAX_FRICTION_FORCE] = largest
     return largest * min(largest / mean, 1.0)

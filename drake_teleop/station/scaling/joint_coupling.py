@@ -54,6 +54,7 @@ class JointCoupling(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
+        """Return the leader's positions plus the offset, or the held command (n,) [rad]."""
         memory, n = context.get_discrete_state(0).value(), len(self._offset)
         joints: Array = memory[:n]
         return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints

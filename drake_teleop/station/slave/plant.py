@@ -169,7 +169,7 @@ def AddSlavePlant(
         plant.set_name("slave_plant")
         areas = ContactModel.kHydroelasticWithFallback
         plant.set_contact_model(areas if environment.hydroelastic else ContactModel.kPoint)
-        plant.set_stiction_tolerance(environment.slip)
+        plant.set_stiction_tolerance(environment.slip_speed)
     parsed = ParseSlave(plant, slave)
     instance, tool = parsed.instance, parsed.tool
     surroundings = None if environment is None else AddEnvironment(plant, environment)

@@ -45,7 +45,7 @@ class Scene(Environment):
         "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
     )
     tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
-    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
+    slip_speed: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
     def path(self) -> Path:

@@ -124,9 +124,9 @@ def MakeToolContactModel(
         for index, own in shapes.items()
         for shape in own
     }
-    inspector, slip = scene_graph.model_inspector(), environment.slip
+    inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     try:
-        found = FindContactPairs(plant, inspector, from_S, touched.instances, slip, order)
+        found = FindContactPairs(plant, inspector, from_S, touched.instances, slip_speed, order)
     except DrakeTeleopError as error:
         return contact._replace(drake_contact_reason=str(error))
     if not len(found.compiled_pairs):
@@ -157,7 +157,7 @@ def _check_body_masses(plant: MultibodyPlant, context: Context, contact: ToolCon
         bodies = {name: plant.get_body(index) for name, index in contact.moving_bodies.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         what = f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia"
-        raise DrakeTeleopError(what, where="environment", remedy="give it both, or fix it")
+        raise DrakeTeleopError(what, where="environment", remedy="give it both, or weld it")
 
 
 def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
