@@ -399,9 +399,6 @@ def drive(
         port: TCP port of the page on 127.0.0.1; 0: any free port.
         browser: whether to open the page.
         device: haptic device: udp://127.0.0.1:PORT of a client, or haply://localhost:10001.
-
-    Raises:
-        DrakeTeleopError: if the scenario is invalid, or the port is in use.
     """
     if not isinstance(scenario, Scenario):
         scenario = LoadScenario(scenario)

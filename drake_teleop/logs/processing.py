@@ -365,8 +365,8 @@ def eliminate_log(
         statistic: contact statistic, "level", "cusum" or "glr".
 
     Raises:
-        DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
-            with static poses, or an unknown statistic.
+        DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
+            static poses.
     """
     check_log_arguments(path, cutoff_hz)
     if untouched_s is not None:

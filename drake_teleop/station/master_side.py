@@ -46,9 +46,6 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
 
     Args:
         operator: custom operator, added as "live_hand"; None for the scenario's operator.
-
-    Raises:
-        DrakeTeleopError: for an invalid scenario.
     """
     check_scenario(scenario)
     hand, scaling = scenario.operator.hand, scenario.kinematic_scaling

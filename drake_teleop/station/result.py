@@ -87,9 +87,6 @@ class SimulationResult:
         t: (N,) sample times [s].
         signals: arrays by name, (N, k), or (N,) for one component.
         specs: description of each signal; they define the order.
-
-    Raises:
-        DrakeTeleopError: if names, lengths or numbers of components are inconsistent.
     """
 
     def __init__(
@@ -253,11 +250,7 @@ class SimulationResult:
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
-        """Read a file, or a folder of parts, from `write_parquet` or `simulate`.
-
-        Raises:
-            DrakeTeleopError: if the log is absent or has another format.
-        """
+        """Read a file, or a folder of parts, from `write_parquet` or `simulate`."""
         on_disk = cls.scan_parquet(path)
         return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
 
@@ -267,9 +260,6 @@ class SimulationResult:
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.
-
-        Raises:
-            DrakeTeleopError: if the log is absent or has another format.
         """
         import polars as pl
 
@@ -292,9 +282,6 @@ class SimulationResult:
         Args:
             names: signals, or columns such as "contact_wrench_S.f_z"; default: all signals.
             contact: (N,) booleans; times in contact are shaded.
-
-        Raises:
-            KeyError: for an unknown name.
         """
         from drake_teleop.common.style import Picture, plot_style, shade_contact
 

@@ -49,8 +49,8 @@ def simulate(
             from the disk at each access.
 
     Raises:
-        DrakeTeleopError: if an argument is invalid, a joint of the slave leaves its range, the
-            folder contains other files, or at a fault (`Simulation.on_fault`).
+        DrakeTeleopError: if a joint of the slave leaves its range, the folder contains other
+            files, or at a fault (`Simulation.on_fault`).
     """
     expect_type(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
     if simulation is None:

@@ -80,8 +80,7 @@ def MakeSlaveSide(
             parts of a sample are connected if it has such inputs.
 
     Raises:
-        DrakeTeleopError: for an invalid value, an unreachable start, scales that require a load
-            estimate if there is none, or contact detection without noise floor.
+        DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
     """
     check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)

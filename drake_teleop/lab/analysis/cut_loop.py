@@ -60,10 +60,7 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force.
-
-    Raise the errors of `period_map_of_cut_loop`.
-    """
+    """Return the loop without delay, cut at the displayed force."""
     M = period_map_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()

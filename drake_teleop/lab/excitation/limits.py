@@ -38,17 +38,14 @@ class Limits(NamedTuple):
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
-        velocity, acceleration: (n,) joint limits [rad/s], [rad/s^2]; may be inf.
-        max_torques: (n,) joint limits [N m]; may be inf.
+        velocity, acceleration, max_torques: (n,) [rad/s], [rad/s^2], [N m]; may be inf.
         heaviest_phi: (10,) heaviest expected load about the origin of S.
         max_sensor_norms: (4,) of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
         points_S: (P, 3) points in S that remain in the box [m].
         box_middle, box_half: (3,) middle and half size of the box in W [m]; half may be inf.
         capsule_links: (C,) link of each capsule, a row of `link_motions`; -1 is the world.
-        capsule_ends: (C, 2, 3) end points of each capsule in the link's frame [m].
-        capsule_radius: (C,) radii [m].
-        capsule_pairs: (K, 2) pairs of capsules with a minimum distance.
-        min_pair_distances: (K,) these distances [m], possibly negative.
+        capsule_ends, capsule_radius: (C, 2, 3) end points in the link's frame, (C,) radii [m].
+        capsule_pairs, min_pair_distances: (K, 2), and (K,) distances [m], possibly negative.
         clearance: minimum distance of the true shapes [m].
     """
 

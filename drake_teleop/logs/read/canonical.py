@@ -69,9 +69,6 @@ class Log:
         described: the description, with estimates for `auto`.
         estimated: those of "gravity" and "weight" that are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.
     """
 
     t: Array

@@ -84,9 +84,6 @@ def read_log(
         bandwidth_hz: bandwidth of derivatives, see `smooth_derivatives`; None: the largest.
         differentiate: False leaves the motion zero where poses are its only source, for users of
             `Log.posed`.
-
-    Raises:
-        DrakeTeleopError: naming file, field and remedy.
     """
     expect_type((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= MIN_BANDWIDTH_HZ:

@@ -31,9 +31,6 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
         pair: wrench over the step to k: `held` f_(k-1), `backward` f_k or `mean` of both.
-
-    Raises:
-        DrakeTeleopError: for an unknown pair or arrays of wrong shape.
     """
     if pair not in WEIGHT_OF_PRESENT_WRENCH:
         raise DrakeTeleopError(

@@ -103,8 +103,8 @@ def AddWristSensor(
         name: name of the block; its noise source is named "<name>_noise".
 
     Raises:
-        DrakeTeleopError: if the plant is not finalized, not in this builder or has no such weld, if
-            the tool has no mass, or for a period or bandwidth that does not fit.
+        DrakeTeleopError: for a plant that is not finalized or in another builder, a missing weld, a
+            tool without mass, or an unsuitable period.
     """
     _check_plant(builder, plant)
     sensor = PlantWristSensor(
