@@ -145,9 +145,6 @@ def run_scenario(
         progress: True shows progress bars; or a `StartStage` that receives the progress.
         log: folder of the log, see `simulate`.
         fresh: True ignores the cached load.
-
-    Raises:
-        DrakeTeleopError: for an unusable scenario or a joint outside its range.
     """
     check_scenario(scenario)
     estimates_load = scenario.load_estimator.enabled

@@ -79,13 +79,13 @@ def _cross_fade_weight(change, time):
 
 
 @njit(cache=True)
-def _cross_fade_into(wrench, before, share, most, out):
+def _cross_fade_into(wrench, before, share, max_force, out):
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
     force = _force_norm(out)
-    if force > most:
+    if force > max_force:
         for i in range(6):
-            out[i] *= most / force
+            out[i] *= max_force / force
 
 
 @njit(cache=True)
@@ -141,28 +141,29 @@ class CrossFade(LeafSystem):
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
-    def LimitForce(self, context: Context, most: float) -> None:
-        """Limit the force to `most` [N] until the new wrench is at most that large."""
-        context.get_mutable_discrete_state(self._state)[1] = most
+    def LimitForce(self, context: Context, max_force: float) -> None:
+        """Limit the force to `max_force` [N] until the new wrench is at most that large."""
+        context.get_mutable_discrete_state(self._state)[1] = max_force
 
     def force_above_limit(self, context: Context) -> float:
         """Return the force [N] by which `LimitForce` reduces the wrench; 0 during a cross-fade."""
-        share, most = context.get_discrete_state(self._state).value()
-        return max(_force_norm(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
+        share, max_force = context.get_discrete_state(self._state).value()
+        force = _force_norm(self._wrench.Eval(context))
+        return max(force - max_force, 0.0) if share == 1.0 else 0.0
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        share, most = state.value(self._state)
+        share, max_force = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
             state.get_mutable_value(self._state)[0] = _cross_fade_weight(change, context.get_time())
-        elif most < math.inf and _force_norm(self._wrench.Eval(context)) <= most:
+        elif max_force < math.inf and _force_norm(self._wrench.Eval(context)) <= max_force:
             state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        share, most = context.get_discrete_state(self._state).value()
+        share, max_force = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
-        if share == 1.0 and most == math.inf:  # the usual case, in half the time
+        if share == 1.0 and max_force == math.inf:  # the usual case, in half the time
             output.SetFromVector(wrench)
             return
         before = context.get_numeric_parameter(self._change).value()[2:]
-        _cross_fade_into(wrench, before, share, most, output.get_mutable_value())
+        _cross_fade_into(wrench, before, share, max_force, output.get_mutable_value())

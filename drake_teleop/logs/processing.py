@@ -176,9 +176,6 @@ def identify_log(
         cutoff_hz: cut-off of the low-pass; None for no filter.
         delay: delay of the motion behind the wrench [s], or "auto".
         checks: result of `check_file` for this log, if known.
-
-    Raises:
-        DrakeTeleopError: for an unusable log, an unknown method or a worthless result.
     """
     METHODS.check(method, "method")
     check_log_arguments(path, cutoff_hz)

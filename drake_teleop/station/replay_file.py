@@ -217,13 +217,13 @@ class ForceArrow:
         head = MeshcatCone(_ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M, 0.4 * _ARROW_HEAD_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
 
-    def show_force(self, canvas: Canvas, replay_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `replay_time` [s]."""
+    def show_force(self, canvas: Canvas, replay_time: float, p_W: Array, force: Array) -> None:
+        """Show `force` (3,) [N] at the point `p_W` (3,) [m], both in W, at `replay_time` [s]."""
         length = _ARROW_LENGTH_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _ARROW_HEAD_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
-        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _ARROW_HEAD_M) * R[:, 2]
+        middle, tip = p_W + 0.5 * shaft * R[:, 2], p_W + (shaft + _ARROW_HEAD_M) * R[:, 2]
         back = along @ _HALF_TURN_ABOUT_X
         put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), replay_time)

@@ -178,11 +178,7 @@ class SimulationResult:
         return ["t", *self._specs, *columns]
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the samples as a pandas frame, with the columns of `to_dataframe`.
-
-        Raises:
-            DrakeTeleopError: if pandas (extra `notebook`) is not installed.
-        """
+        """Return the samples as a pandas frame, with the columns of `to_dataframe`."""
         try:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
@@ -204,9 +200,6 @@ class SimulationResult:
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
         SI units, with the sign of Eq. (1). ``t`` is the sampling instant; each sample has one row.
-
-        Raises:
-            DrakeTeleopError: if the sensor's signals were not recorded.
         """
         import polars as pl
 

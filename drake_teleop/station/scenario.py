@@ -193,9 +193,6 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     """Load a shipped scenario by name, or a YAML file.
 
     Missing fields keep their defaults. Paths in it are relative to the file's folder.
-
-    Raises:
-        DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
     return ScenarioFromData(*ReadScenarioData(name_or_path))
 

@@ -115,7 +115,7 @@ def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
 
 
 def test_missing_description_raises_error(tmp_path: Path) -> None:
-    with pytest.raises(DrakeTeleopError, match="no such file"):
+    with pytest.raises(DrakeTeleopError, match="no such log description"):
         load_description(tmp_path / "log.yaml")
 
 

@@ -137,18 +137,18 @@ def update_estimate(estimate, V, wrench, root):
 
 
 @njit(cache=True)
-def _update_filter(memory, place, block, noise):
-    phi = memory[place + 6 : place + 16].copy()
+def _update_filter(memory, filter_start, block, noise):
+    phi = memory[filter_start + 6 : filter_start + 16].copy()
     wrench = memory[_WRENCH_SUM_START:_MOTION_SUM_START]
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
     V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
-    before = memory[place : place + 272].copy()
+    before = memory[filter_start : filter_start + 272].copy()
     chi = update_estimate(before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
-        copy_into(memory, place, before, 0, 272)
+        copy_into(memory, filter_start, before, 0, 272)
     else:
         long_term_root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
-        update_estimate(memory[place : place + 272], V, wrench, long_term_root)
+        update_estimate(memory[filter_start : filter_start + 272], V, wrench, long_term_root)
     return chi
 
 

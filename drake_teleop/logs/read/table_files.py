@@ -196,14 +196,14 @@ def _to_numpy(series: pl.Series) -> NDArray:
 
 
 def array_columns(
-    arrays: Mapping[str, NDArray], most: int | None = _MAX_ELEMENT_COLUMNS
+    arrays: Mapping[str, NDArray], max_elements: int | None = _MAX_ELEMENT_COLUMNS
 ) -> dict[str, NDArray]:
-    """Return arrays (N, ...) by name as columns, and their first `most` elements as `name[k]`."""
+    """Return arrays (N, ...) by name as columns, and their first `max_elements` as `name[k]`."""
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": column
         for name, array in arrays.items()
-        for k, column in enumerate(array.reshape(len(array), -1).T[:most])
+        for k, column in enumerate(array.reshape(len(array), -1).T[:max_elements])
         if 1 < array.ndim <= 3
     }
     return parts | arrays

@@ -88,11 +88,11 @@ def scale_group(a, g, s):
 
 
 @njit(cache=True)
-def limit_group(a, g, most):
-    """Shorten group `g` of the vector `a` (6,) to at most the length `most`."""
+def limit_group(a, g, max_length):
+    """Shorten group `g` of the vector `a` (6,) to at most `max_length`."""
     size = length_of_group(a, g)
-    if size > most:
-        scale_group(a, g, most / size)
+    if size > max_length:
+        scale_group(a, g, max_length / size)
 
 
 @njit(cache=True)

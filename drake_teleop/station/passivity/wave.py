@@ -140,13 +140,13 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _limit_wrench_change(g, energy, dx, most, held, wrench):
+def _limit_wrench_change(g, energy, dx, max_change, held, wrench):
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
         size += (wrench[i] - held[i]) ** 2
-    if size <= most * most:
+    if size <= max_change * max_change:
         return False
-    share = most / math.sqrt(size)
+    share = max_change / math.sqrt(size)
     now, last = energy - dot_of_group(wrench, dx, g), energy - dot_of_group(held, dx, g)
     if (1.0 - share) * last + share * now < 0.0:
         share = last / (last - now) if now > 0.0 else 1.0
