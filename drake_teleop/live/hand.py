@@ -167,7 +167,7 @@ class LiveHand(Operator):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def KeepWrench(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Shift the intended motion so that the wrench has no step; the shift decays."""
+        """Shift the intended motion so that the new impedance causes no step of the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD_INDEX] < 0.5:
             return

@@ -38,7 +38,7 @@ class Limits(NamedTuple):
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
-        velocity, acceleration, max_torques: (n,) [rad/s], [rad/s^2], [N m]; may be inf.
+        velocity, acceleration, max_torques: (n,) of joints [rad/s, rad/s^2, N m]; may be inf.
         heaviest_phi: (10,) heaviest expected load about the origin of S.
         max_sensor_norms: (4,) of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
         points_S: (P, 3) points in S that remain in the box [m].
@@ -149,7 +149,7 @@ def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, larg
 
 @njit(cache=True)
 def _exact_and_smooth_maximum(use, sharpness):
-    """Return the maximum over all `use` (T, m), exact and smooth; `use` becomes its gradient."""
+    """Return exact and smooth maximum over all of `use` (T, m); `use` becomes the gradient."""
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):

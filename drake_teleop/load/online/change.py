@@ -290,7 +290,7 @@ def change_detector_parameters(
     positive_array("period", period)
     if not 0.0 <= relative_wrench_error < 1.0:
         what = f"{relative_wrench_error} is outside the range 0 <= relative_wrench_error < 1"
-        remedy = "give the relative error of the model"
+        remedy = "give the relative error of the wrench"
         raise DrakeTeleopError(what, where="relative_wrench_error", remedy=remedy)
     if mass_std_ratio is None:
         mass_std_ratio = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * relative_wrench_error)

@@ -46,7 +46,7 @@ _C_OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
 
 
 class _CScalar:
-    """C expression of a number; `array` names the parameter of which it is an element."""
+    """C expression of a number; `array`: parameter that contains it, or ""; `constant`: fixed."""
 
     def __init__(self, text: str, kind: str, array: str = "", constant: bool = False) -> None:
         self.text, self.kind, self.array, self.constant = text, kind, array, constant

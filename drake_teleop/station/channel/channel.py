@@ -252,7 +252,7 @@ def step_slave_end(
 
 @njit(cache=True)
 def _pose_increment_into(pose, before, dx):
-    """Write the change `dx` (6,) since the last pose, 0 without two finite ones; return finite."""
+    """Write the change `dx` (6,), 0 unless both are finite; return whether `pose` is finite."""
     valid = all_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
