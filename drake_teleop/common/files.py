@@ -24,6 +24,8 @@ _RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
 LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
+INPUTS_FILE = "inputs.csv"
+"""Name of the file with the inputs of a recorded drive."""
 
 
 class CannotWrite(DrakeTeleopError):
@@ -107,10 +109,6 @@ def output_folder(
         after = _file_times_and_inodes(out)
         existing = [name for name in after if name in kept or before.get(name) != after[name]]
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
-
-
-INPUTS_FILE = "inputs.csv"
-"""Name of the file with the inputs of a recorded drive."""
 
 
 def check_inputs_are_kept(result: Path, given: str | Path | None = None) -> None:

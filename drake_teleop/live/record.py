@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -21,10 +19,9 @@ from drake_teleop.common.version import __version__
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
 from drake_teleop.live.inputs import Inputs, csv_header, csv_row
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.scenario import Scenario, referenced_files
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.simulation import LogOnDisk
-from drake_teleop.station.slave.model.model_references import list_model_files
 
 LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 #: Marker file: the positions in the inputs are those of a haptic device.
@@ -33,14 +30,9 @@ DEVICE_MARKER_FILE = "device.txt"
 
 def versions_and_file_digest(scenario: Scenario) -> dict[str, str]:
     """Return versions of drake_teleop and Drake, and a digest of the scenario's files."""
-    digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
-    while left:
-        value = left.pop()
-        if isinstance(value, (dict, list)):
-            left.extend(value.values() if isinstance(value, dict) else value)
-        elif isinstance(value, str) and os.path.isabs(value) and os.path.isfile(value):
-            for file in list_model_files(Path(value), scenario.slave.package_folders):
-                digest.update(file.read_bytes())
+    digest = hashlib.sha256()
+    for file in referenced_files(scenario):
+        digest.update(file.read_bytes())
     versions = {"drake_teleop": __version__, "drake": version("drake")}
     return versions | {"files": digest.hexdigest()[:12]}
 

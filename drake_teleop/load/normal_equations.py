@@ -47,10 +47,9 @@ _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 _SAME_POSE_WITHIN_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _MAX_ROUNDING_RESIDUAL = 1e-6
-# Indices of wrench and specific force in z.
+# Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
-OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
-"""Indices of the products w_i w_j in z."""
+_OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +136,9 @@ class SecondMoments:
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
-        products = self.mean_products[0, OMEGA_PRODUCT_INDICES]
+        products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
         for std, J in zip(
-            noise.motion[1], omega_product_jacobians(OMEGA_PRODUCT_INDICES, 19), strict=True
+            noise.motion[1], omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19), strict=True
         ):
             Q += std**2 * J.T @ products @ J
         return Q

@@ -53,7 +53,7 @@ _CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
-def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
+def _estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
     posed = log.posed
     assert posed is not None
@@ -121,7 +121,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
     return moved, np.cumsum(change[:-1]) > 0.0
 
 
-def clock_rate_notes(found: PoseMotion) -> list[str]:
+def _clock_rate_notes(found: PoseMotion) -> list[str]:
     """Return a note if the clock rate of the poses differs from that of the wrench."""
     if not found.clock_rate_error:
         return []
@@ -182,7 +182,7 @@ def read_aligned_log(
             moved = replace_specific_force_by_acceleration(moved)
             plain = None if plain is None else replace_specific_force_by_acceleration(plain)
         edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
-        notes = tuple(clock_rate_notes(motion))
+        notes = tuple(_clock_rate_notes(motion))
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge, notes)
         if log.posed is None or log.posed.imu is None:
             return smooth
@@ -246,7 +246,7 @@ def fit_load_to_posed_log(
     """
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
-    found, source = estimate_motion_and_load(log, delay)
+    found, source = _estimate_motion_and_load(log, delay)
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
@@ -320,7 +320,7 @@ def _physically_consistent_theta(found: PoseEstimate) -> Array:
 
 
 def _note_on_estimate(found: PoseEstimate, stated: float) -> str:
-    notes = [*([found.note] if found.note else []), *clock_rate_notes(found)]
+    notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(

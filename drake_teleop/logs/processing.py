@@ -178,13 +178,13 @@ def identify_log(
         checks: result of `check_file` for this log, if known.
     """
     METHODS.check(method, "method")
-    check_log_arguments(path, cutoff_hz)
+    _check_log_arguments(path, cutoff_hz)
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
         return _read_and_identify_log(path, method, cutoff_hz, delay, check)
 
 
-def check_log_arguments(path: Any, cutoff_hz: Any) -> None:
+def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
     expect_type((str, Path), path, "log", "give the file's name")
     if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
@@ -365,7 +365,7 @@ def eliminate_log(
         DrakeTeleopError: for an unusable file, contradictory scales, or `causal` or `free` with
             static poses.
     """
-    check_log_arguments(path, cutoff_hz)
+    _check_log_arguments(path, cutoff_hz)
     if untouched_s is not None:
         start_s, stop_s = finite_array("untouched_s", untouched_s, 2).tolist()
         untouched_s = start_s, stop_s

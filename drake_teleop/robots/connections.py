@@ -178,7 +178,8 @@ def _open_streams(
 def _open_registered_source(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> Source:
     kind = _address_scheme(address)
     if kind not in SOURCES:
-        remedy = f"give {_address_forms(SOURCES)}, or replay:LOG"
+        other = "" if kind == "replay" else ", or replay:LOG"  # a log has no separate motion
+        remedy = f"give {_address_forms(SOURCES)}{other}"
         raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
     return SOURCES[kind](address, rate_hz, joints)
 

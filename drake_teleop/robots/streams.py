@@ -40,9 +40,8 @@ NONZERO_WRENCH_FLAGS = (
 """Flags with a nonzero wrench."""
 
 
-WRENCH_AND_MOTION, WRENCH, POSE, IMU, JOINTS, ACCELERATION = (
-    *("wrench and motion", "wrench", "pose", "imu", "joints", "acceleration"),
-)
+WRENCH_AND_MOTION, WRENCH, POSE = "wrench and motion", "wrench", "pose"
+IMU, JOINTS, ACCELERATION = "imu", "joints", "acceleration"
 """Streams of readings."""
 
 

@@ -21,7 +21,7 @@ from drake_teleop.common.errors import (
     wrap_read_errors,
 )
 from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
-from drake_teleop.common.numeric import float_array
+from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
 if TYPE_CHECKING:
@@ -98,13 +98,13 @@ class SimulationResult:
             odd = sorted(self._specs.keys() ^ signals.keys())
             what = f"only one of `signals` and `specs` contains {', '.join(odd)}"
             raise DrakeTeleopError(what, where="signals", remedy="give each signal one spec")
-        self._values: Mapping[str, NDArray[np.float64]]
+        self._values: Mapping[str, Array]
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
         else:
             self._values = {name: self._checked_values(name, signals[name]) for name in self._specs}
 
-    def _checked_values(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
+    def _checked_values(self, name: str, values: ArrayLike) -> Array:
         array = float_array(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
@@ -116,7 +116,7 @@ class SimulationResult:
         return _read_only_view(array)
 
     @property
-    def t(self) -> NDArray[np.float64]:
+    def t(self) -> Array:
         """Sample times (N,) [s]."""
         return self._t
 
@@ -138,12 +138,12 @@ class SimulationResult:
         }
 
     @overload
-    def __getitem__(self, name: str) -> NDArray[np.float64]: ...
+    def __getitem__(self, name: str) -> Array: ...
 
     @overload
     def __getitem__(self, name: slice) -> SimulationResult: ...
 
-    def __getitem__(self, name: str | slice) -> NDArray[np.float64] | SimulationResult:
+    def __getitem__(self, name: str | slice) -> Array | SimulationResult:
         if isinstance(name, slice):
             rows = {each: self._values[each][name] for each in self.signals}
             return SimulationResult(self._t[name], rows, self.specs)
@@ -208,7 +208,7 @@ class SimulationResult:
             what = f"the result contains no {', '.join(missing)} (a sensor log needs these signals)"
             remedy = "record the wrist sensor's signals"
             raise DrakeTeleopError(what, where="sensor log", remedy=remedy)
-        columns: dict[str, NDArray[np.float64]] = {}
+        columns: dict[str, Array] = {}
         for name, names in _SENSOR_LOG_COLUMNS_OF_SIGNAL.items():
             columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
@@ -333,11 +333,11 @@ class SimulationResult:
         )
 
 
-class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
+class _SignalsOnDisk(Mapping[str, Array]):
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
 
-    def __getitem__(self, name: str) -> NDArray[np.float64]:
+    def __getitem__(self, name: str) -> Array:
         columns = self._columns[name]
         with wrap_read_errors(self._path, "write it again"):
             return _read_only_view(_read_columns(self._path, columns))
@@ -352,9 +352,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         return len(self._columns)
 
 
-def _curve_extremes(
-    t: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _curve_extremes(t: Array, values: Array) -> tuple[Array, Array]:
     length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values
@@ -378,7 +376,7 @@ def _files_of_log(path: Path) -> list[Path]:
     return sorted(path.glob(LOG_PARTS_PATTERN)) or [path]
 
 
-def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
+def _read_columns(path: Path, columns: list[str]) -> Array:
     import polars as pl
 
     refuse_fork()

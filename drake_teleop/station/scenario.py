@@ -44,6 +44,7 @@ from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.model.model_references import list_model_files
 from drake_teleop.station.slave.position_servo import POSITION_INTERFACES
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
@@ -251,6 +252,22 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     scenario.check(where)
     absolute: Scenario = with_absolute_paths(scenario, Path(where).parent)
     return absolute
+
+
+def referenced_files(scenario: Scenario) -> list[Path]:
+    """Return the files at absolute paths in the scenario, and the files that these include."""
+    leader = scenario.master.leader
+    packages = map(Path, () if leader is None else leader.package_paths)
+    folders = (*scenario.slave.package_folders, *packages)
+    files: list[Path] = []
+    left: list[Any] = [dataclasses.asdict(scenario)]
+    while left:
+        value = left.pop()
+        if isinstance(value, (dict, list)):
+            left.extend(value.values() if isinstance(value, dict) else value)
+        elif isinstance(value, str) and os.path.isabs(value):
+            files += list_model_files(Path(value), folders)
+    return files
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:

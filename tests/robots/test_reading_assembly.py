@@ -47,7 +47,7 @@ def truth(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 class StreamStub:
-    """Source of parts without data."""
+    """Source of streams without data."""
 
     def __init__(self, *streams: str) -> None:
         self.dt, self.streams = DT, streams
@@ -194,6 +194,12 @@ def test_imu_gives_the_motion() -> None:
 def test_wrench_without_motion_is_refused() -> None:
     with pytest.raises(DrakeTeleopError, match=r"^ros2://ft: delivers no motion; give --motion"):
         ReadingStreams(StreamStub(WRENCH), where="ros2://ft")
+
+
+def test_log_is_not_recommended_as_source_of_the_motion_alone() -> None:
+    match = r"^replay:a.csv: is not the address of a source; give (?!.*replay:LOG)"
+    with pytest.raises(DrakeTeleopError, match=match):
+        open_source("posed://127.0.0.1:0", None, rate_hz=500.0, motion="replay:a.csv")
 
 
 @pytest.mark.parametrize("angles", [(20.0, -35.0, 110.0), (0.0, 80.0, 30.0), (-170.0, 5.0, 0.0)])

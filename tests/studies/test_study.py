@@ -291,14 +291,20 @@ def test_folder_of_another_study_is_refused(serial, files):
     assert parts(serial[1]) == before
 
 
-def test_folder_of_another_arm_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize("edited", ["arm.urdf", "leader.urdf", "scene.sdf", "ping.csv"])
+def test_folder_with_runs_of_an_edited_file_is_refused(tmp_path, monkeypatch, edited):
     monkeypatch.setattr(studies.StationRunFunction, "__call__", lambda *_: {"hand_work_J": 1.0})
     study = "{scenario: base.yaml, factors: [{field: force_scaling.sigma, values: [0]}]}"
-    files = {"base.yaml": "slave: {model: arm.urdf}", "study.yaml": study, "arm.urdf": "<robot/>"}
+    base = (
+        "{slave: {model: arm.urdf}, channel: {trace: ping.csv}, environment: [!Scene {file:"
+        " scene.sdf}], master: {model: leader, leader: {file: leader.urdf, hand_frame: grip}}}"
+    )
+    files = {"base.yaml": base, "study.yaml": study, "ping.csv": "time,delay\n0,0.01\n1,0.01\n"}
+    files |= {"arm.urdf": "<robot/>", "leader.urdf": "<robot/>", "scene.sdf": "<sdf/>"}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     study_command(tmp_path / "study.yaml", tmp_path / "out", jobs=1, quiet=True)
-    (tmp_path / "arm.urdf").write_text("<robot></robot>")
+    (tmp_path / edited).write_text(f"{files[edited]}\n")
     with pytest.raises(DrakeTeleopError, match="another study"):
         study_command(tmp_path / "study.yaml", tmp_path / "out", jobs=1, quiet=True)
 

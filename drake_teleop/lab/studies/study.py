@@ -27,6 +27,7 @@ from drake_teleop.station.scenario import (
     ScenarioFromData,
     ScenarioNames,
     find_shipped_file,
+    referenced_files,
     settings_from_data,
 )
 
@@ -100,8 +101,9 @@ def study_command(
     study.check_num_runs(str(path), yes)
     known = study.scenario in ScenarioNames()
     data, where = ReadScenarioData(study.scenario if known else path.parent / study.scenario)
-    slave = ScenarioFromData(data, where).slave
-    models = [sha256(file.read_bytes()).hexdigest() for file in slave.model_files()]
+    scenario = ScenarioFromData(data, where)
+    files = [*scenario.slave.model_files(), *referenced_files(scenario)]
+    digests = [sha256(file.read_bytes()).hexdigest() for file in files]
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
@@ -111,7 +113,7 @@ def study_command(
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(
-        study, out, work, {"data": data, "models": models}, jobs=jobs, cluster=cluster,
+        study, out, work, {"data": data, "files": digests}, jobs=jobs, cluster=cluster,
         executor=executor, shard=shard, merge=merge, progress=shown,
     )  # fmt: skip
     summary = _summarise_measures(study, rows)

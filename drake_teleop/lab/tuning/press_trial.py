@@ -246,10 +246,8 @@ class GammaSearch:
         )
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
-        quiet = (
-            rms_above_hz(run.hand_force[hold], run.t[1] - run.t[0], REST_BAND_HZ)
-            <= MAX_REST_FORCE_N
-        )
+        force, period = run.hand_force[hold], run.t[1] - run.t[0]
+        quiet = rms_above_hz(force, period, REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 

@@ -294,12 +294,8 @@ def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
 
 
 def _torque_to_position(found: _Columns, plain: _NamesAndUnits) -> None:
-    bare = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])] == [
-        "tx",
-        "ty",
-        "tz",
-    ]
-    if bare and "force" not in found and "position" not in found:
+    ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
+    if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 

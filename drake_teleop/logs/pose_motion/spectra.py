@@ -288,13 +288,11 @@ def noise_moments(
     still, first, second, third = _signal_covariances_by_rotation(zeta, weight)
     eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
-    parts = [
-        *((position_power * w2**2, eye), (rotation_power, still)),
-        *((rotation_power * w2, first + second), (rotation_power * w2**2, third)),
-    ]
+    powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
+    shapes = eye, still, first + second, third
     Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
     signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
-    for power, shape in parts:
+    for power, shape in zip(powers, shapes, strict=True):
         Q[:, signals, signals] += bands.sums_over_bands(power)[:, None, None] * shape
         Q[:, rates, rates] += bands.sums_over_bands(power * w2)[:, None, None] * shape
     return Q

@@ -203,8 +203,8 @@ def array_columns(
     parts = {
         f"{name}[{k}]": column
         for name, array in arrays.items()
-        for k, column in enumerate(array.reshape(len(array), -1).T[:max_elements])
         if 1 < array.ndim <= 3
+        for k, column in enumerate(array.reshape(len(array), -1).T[:max_elements])
     }
     return parts | arrays
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     MEMORY_SIZE,
@@ -17,8 +17,6 @@ from drake_teleop.station.passivity.memory import (
     STORED_ENERGY,
 )
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
-
-Array = NDArray[np.float64]
 
 #: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
 WEIGHT_OF_PRESENT_WRENCH = {"held": 0.0, "backward": 1.0, "mean": 0.5}

@@ -7,10 +7,10 @@ Without an energy balance, an unstable loop stays unstable, but its limit cycle 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.memory import LAST_WRENCH, MOTION_SCALE, own_parameters
@@ -27,7 +27,7 @@ class ForceLimitConfig:
     force: float = quantity(1.0, "N", 0.0, 1e4, "largest force at the hand")
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 

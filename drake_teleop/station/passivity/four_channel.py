@@ -6,11 +6,9 @@ docs/theory.md, (T39). There is no energy balance: any delay makes the channel a
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -70,7 +68,7 @@ class FourChannelConfig:
         "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[_COUPLING_STIFFNESS], p[_COUPLING_DAMPING] = self.stiffness, self.damping
         p[_SLAVE_FEEDBACK_GAIN], p[_HAND_FEEDBACK_GAIN] = self.slave_feedback, self.hand_feedback
 

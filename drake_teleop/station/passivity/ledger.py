@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import ledger_slave
 from drake_teleop.station.passivity.ledger_slave import (
@@ -156,7 +156,7 @@ class LedgerConfig:
         length=2,
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[INITIAL_LEDGER_ENERGY], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -168,13 +168,13 @@ class LedgerConfig:
         p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
 
 
-def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
+def initialize(p: Array, memory: Array) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
     memory[STORED_ENERGY] = p[INITIAL_LEDGER_ENERGY] / 2.0
     memory[SERVO_MODEL_POSE] = memory[COMMAND_POSE]
 
 
-def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
     """Return the largest speed (2,) of the slave that its energy reserve permits [m/s, rad/s].
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import address_of_function, make_call_at_address, njit
 from drake_teleop.common.config import (
@@ -25,6 +24,7 @@ from drake_teleop.common.config import (
     unchecked_assignments,
 )
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import (
@@ -92,12 +92,12 @@ class PassivityMethod(NamedTuple):
     master_step: Any
     slave_step: Any
     record_command: Any = _ignore_command_change
-    initialize: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
+    initialize: Callable[[Array, Array], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
     needs_arm_mass: bool = False
     needs_load_apart: bool = False
-    speed_limit: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]] | None = None
+    speed_limit: Callable[[Any, Array], Array] | None = None
 
 
 _TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
@@ -245,7 +245,7 @@ def method_parameters(
     config: PassivityConfig,
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the parameters (NUM_PARAMETERS,) of the selected method for the compiled steps.
 
     Args:
@@ -268,9 +268,7 @@ def method_parameters(
     return p
 
 
-def initial_method_memory(
-    method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     """Return the memory (MEMORY_SIZE,) of one end of the channel before its first step.
 
     `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.

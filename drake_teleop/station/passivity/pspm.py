@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -69,7 +69,7 @@ class PspmConfig:
         [0.5, 0.005], "N s/m, N m s/rad", 0.0, 1e6, "B, damper at the hand"
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[_INITIAL_ENERGY], p[_MAX_STORED_ENERGY] = self.initial, self.ceiling
         p[_SPRING_STIFFNESS], p[_HAND_DAMPING] = self.stiffness, self.damping
 

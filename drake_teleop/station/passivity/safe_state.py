@@ -7,9 +7,9 @@ either end are not finite or beyond 1e6 in SI units.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     FILTERED_HAND_VELOCITY,
@@ -46,9 +46,7 @@ _COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
 _LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
 
 
-def initial_master_monitor(
-    device_limits: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+def initial_master_monitor(device_limits: Array | None = None) -> Array:
     """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
 
     With `device_limits` (2,), the device's largest force and torque [N, N m], return that of normal
@@ -63,7 +61,7 @@ def initial_master_monitor(
     return watch
 
 
-def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def initial_slave_monitor(pose: Array) -> Array:
     """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_TIME] = np.inf

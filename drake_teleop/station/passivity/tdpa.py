@@ -9,10 +9,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -128,7 +128,7 @@ class TdpaConfig:
         "stiffness of the hand for the filter of the returned wrench; 0: no filter",
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate
         p[_COMMAND_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
         p[_TARGET_RESERVE], p[_DRAG_WRENCH] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])

@@ -6,11 +6,9 @@ The tank of each end must contain the energy that the wrench can use until the n
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -84,7 +82,7 @@ class TwoLayerConfig:
         [20.0, 200.0], "m/s^2, rad/s^2", 0.0, 1e6, "a_max, largest acceleration of either end"
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[_SEND_RATE], p[_MAX_TANK_DRAIN_RATE] = self.send_rate, self.drain_rate
         p[_INITIAL_TANK_ENERGY], p[_TARGET_TANK_LEVEL], p[_TANK_CAPACITY] = (
             self.initial,

@@ -8,11 +8,9 @@ energy, so jitter and loss create no energy.
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     CHANNEL_FILL_TIME_LEFT,
@@ -85,7 +83,7 @@ class WaveConfig:
         2.0, "1/s", 0.0, 1e3, "rate of the drift correction where it takes no work"
     )
 
-    def pack_into(self, p: NDArray[np.float64]) -> None:
+    def pack_into(self, p: Array) -> None:
         p[WAVE_IMPEDANCE], p[_WAVE_FILTER_TIME] = self.impedance, self.filter
         p[_MATCHING_DAMPER_SHARE], p[_MAX_SILENCE_BEFORE_HOLD] = self.matching, self.patience
         p[_POSE_DRIFT_CORRECTION_RATE] = self.drift_rate
