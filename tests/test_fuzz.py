@@ -21,7 +21,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CASES = Path(__file__).parent / "fuzz_cases"
 SAID = {
     "description-frame_nan.yaml": "imu.frame: must be sensor, base, or a 3x3 rotation",
-    "description-long_name.yaml": "no such log description",
+    "description-long_name.yaml": "no such file",
     "dmd-circle.dmd.yaml": "its joints form a loop through",
     "dmd-own_alias.dmd.yaml": "is nested too deeply",
     "files-absent_folder.json": "includes itself through a.dmd.yaml",
