@@ -100,7 +100,7 @@ def test_the_command_line_runs_registered_parts_and_refuses_removed_ones(folder,
     METHODS.remove("share")
     TABLE_READERS.remove(".f64")
     for arguments, says in (
-        (["run", str(recorded)], "'!Table' is not known; use one of"),
+        (["run", str(recorded), "--out", "again"], "'!Table' is not known; use one of"),
         (["identify", "log.f64"], "log.f64: format '.f64' is not known; give a canonical log"),
     ):
         with pytest.raises(SystemExit):

@@ -292,14 +292,23 @@ def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     return still or 5.0 < weight < 20.0
 
 
+def _is_readable(path: Path) -> bool:
+    try:
+        read_log(path)
+    except DrakeTeleopError:
+        return False
+    return True
+
+
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     """Check a log and its description, including causes that identification finds."""
     checks = check_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
     except DrakeTeleopError as error:
-        findings = checks.findings or (Finding("payload", str(error)),)
-        return replace(checks, findings=findings)
+        if checks.findings or not _is_readable(path):
+            return checks
+        return replace(checks, findings=(Finding("payload", str(error)),))
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_std_s, identified.identification.delay_s
     if identified.causes and all(finding.name in FINDINGS_CAUSED_BY_MISFIT for finding in findings):
