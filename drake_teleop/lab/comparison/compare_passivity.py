@@ -168,7 +168,7 @@ def simulate_press(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
+    setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_while_stable(station, setup, task)

@@ -125,7 +125,7 @@ class StationTrial:
             task=task,
             depth=press_depth(self.base_scenario, grip),
         )
-        setup = replace(setup, sheet_spring__slip=_LEAF_SLIP_SPEED_M_S)
+        setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)

@@ -127,9 +127,10 @@ class LogData:
 
 
 def _means_of_consecutive_rows(x: Array, block_rows: int) -> Array:
+    if block_rows == 1:
+        return x
     rows = len(x) // block_rows
-    blocks = x[: rows * block_rows].reshape(rows, block_rows, -1)
-    return blocks.mean(axis=1) if block_rows > 1 else x
+    return np.asarray(x[: rows * block_rows].reshape(rows, block_rows, -1).mean(axis=1))
 
 
 _CHECKED_FIELDS_OF_STREAM = {
