@@ -109,6 +109,8 @@ def test_misspelt_field_raises_with_a_suggestion() -> None:
     scenario = Scenario()
     with pytest.raises(DrakeTeleopError, match=r"ForceScalingConfig\.sgima: .* mean 'sigma'"):
         scenario.force_scaling.sgima = 0.5
+    with pytest.raises(DrakeTeleopError, match=r"slip: there is no .* mean 'slip_speed'"):
+        replace(LoadScenario("contact_transition"), sheet_spring__slip=0.001)  # part of a name
     with pytest.raises(DrakeTeleopError, match="mean 'force_scaling'"):
         scenario.force_scalling = ForceScalingConfig()
     with pytest.raises(DrakeTeleopError, match=r"scenario:force_scaling\.sgima: .* 'sigma'"):

@@ -79,8 +79,9 @@ def refuse_fork() -> None:
 
 
 def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:
-    """Return the remedy for an unknown name: a similar name, or `otherwise`."""
+    """Return the remedy for an unknown name: a similar or longer name, or `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
+    near = near or [other for other in names if len(str(name)) > 2 and str(name) in other]
     return f"did you mean '{near[0]}'?" if near else otherwise
 
 
