@@ -62,6 +62,19 @@ def test_noise_covariance_predicts_the_residual():
     np.testing.assert_allclose(S / scale, residual_covariance(Q, TRUTH) / scale, atol=0.06)
 
 
+def test_noise_of_each_axis_of_the_gyroscope_enters_its_products():
+    """Sum of std_k^2 dz dz^T, where dz is the change of z by angular velocity about axis k."""
+    rng, std = np.random.default_rng(5), np.array([0.01, 0.05, 0.2])
+    clean = *record(200)[:2], rng.normal([0.3, -0.7, 1.1], [1.0, 0.5, 2.0], (200, 3)), np.zeros(3)
+    expected = np.zeros((19, 19))
+    for k in range(3):
+        w = [clean[2] + sign * np.eye(3)[k] for sign in (-1.0, 1.0)]
+        low, high = (x[:, [0, 1, 2, 0, 0, 1]] * x[:, [0, 1, 2, 1, 2, 2]] for x in w)
+        expected[13:, 13:] += std[k] ** 2 * (high - low).T @ (high - low) / 4.0 / 200
+    Q = moments_of(clean).noise_covariance(NoiseStd(omega=std), np.zeros(6))
+    np.testing.assert_allclose(Q, expected, rtol=1e-9, atol=1e-15)
+
+
 @pytest.mark.parametrize("noise", [NoiseStd(), NOISE])
 def test_exact_without_noise(noise):
     form = total_least_squares(moments_of(record()), noise, WRENCH_NOISE)
