@@ -503,8 +503,8 @@ def test_file_overrides_fields_of_a_preset():
     assert ati.force_noise != 0.5
     assert loaded("{preset: ideal}") == loaded("{ideal: true}") == PRESETS["ideal"]
     assert loaded("{force_noise: 0.5}") == WristSensorConfig(force_noise=0.5)
-    with pytest.raises(DrakeTeleopError, match=r"preset: 'jr3' is not known; choose one"):
-        loaded("{preset: jr3}")
+    with pytest.raises(DrakeTeleopError, match=r"preset: 'maker_x' is not known; choose one"):
+        loaded("{preset: maker_x}")
 
 
 def test_preset_without_effect_is_rejected():
