@@ -1,7 +1,8 @@
 """Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
 
 Limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
-its softest and stiffest wall and between them, with several seeds.
+its softest and stiffest wall and between them, with several seeds. Then gamma grows until a run
+fails.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 """Candidates; others are dominated by them or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
-STIFFEST_WALL_FACTORS = (1.2, 2.0)
-"""Factors of the stiffest wall, at which the limits of the settings are searched."""
-BEYOND_MARGIN_FACTOR = 1.2
-"""Factor of the margin of gamma, at which they are searched too."""
+FAILING_OVER_STATED_MARGIN = 1.2
+"""Ratio of the factor of gamma that fails to the stated margin."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
+_MAX_MARGIN = 16.0  # factor of gamma at which the search for a failure ends
+_MAX_FAILING_OVER_STABLE_MARGIN = 1.1  # where its bisection ends
 _NOISE_STEP = 1.03  # gamma fails and holds by so much above and below that of accepted noise
 
 Row = dict[str, Any]
@@ -55,12 +56,14 @@ class SearchResult:
 
     Attributes:
         searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
+        margin: factor of gamma up to which the settings hold.
         given_runs: runs of the user's settings at the stiffest wall.
-        inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
-        beyond_runs: runs with a larger gamma, then at stiffer walls.
+        inside_runs: runs that hold, with gamma and up to the margin.
+        beyond_runs: runs with the smallest factor of gamma that fails, or with the largest factor.
     """
 
     settings: TunedSettings
+    margin: float
     searched_settings: list[Row]
     given_runs: list[Row]
     inside_runs: list[Row]
@@ -121,11 +124,36 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
-    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
-    walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
-    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
-    return SearchResult(chosen, search, given, inside, beyond)
+    stated_margin, held, beyond = _find_margin(chosen, trial, execute)
+    return SearchResult(chosen, stated_margin, search, given, [*inside, *held], beyond)
+
+
+def _find_margin(
+    settings: TunedSettings, trial: StationTrial, execute: RunStudy
+) -> tuple[float, list[Row], list[Row]]:
+    """Return the factor of gamma up to which the settings hold, these runs, and those beyond."""
+    stated = trial.stated_set
+    required = stated.requirements.loop_gain_margin
+    hands, walls = (
+        list(dict.fromkeys((ends[0], ends[-1]))) for ends in (stated.hands, stated.walls)
+    )
+    stable, failing = required, np.inf
+    factor = FAILING_OVER_STATED_MARGIN * required
+    held: list[Row] = []
+    beyond: list[Row] = []
+    while stable < _MAX_MARGIN and failing > _MAX_FAILING_OVER_STABLE_MARGIN * stable:
+        tried = dataclasses.replace(settings, gamma=factor * settings.gamma)
+        study = _study_of_settings(tried, hands, walls, repeats=2)
+        rows = execute(f"margin_{factor:.6g}", study, trial)
+        if all(map(meets_requirements, rows)):
+            stable, held = factor, [*held, *rows]
+        else:
+            failing, beyond = factor, rows
+        factor = 2 * stable if failing == np.inf else float(np.sqrt(stable * failing))
+    if failing == np.inf:
+        return stable, held[: -len(rows)], rows
+    margin = max(required, failing / FAILING_OVER_STATED_MARGIN)
+    return margin, [row for row in held if row["gamma"] <= margin * settings.gamma], beyond
 
 
 def _find_gamma_limit_in_station(
