@@ -38,12 +38,11 @@ CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
 FAILING_OVER_STATED_MARGIN = 1.2
-"""Ratio of the factor of gamma that fails to the stated margin."""
+"""Ratio of the factor of gamma that fails to the stated margin; the search is as fine."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
 _MAX_MARGIN = 16.0  # factor of gamma at which the search for a failure ends
-_MAX_FAILING_OVER_STABLE_MARGIN = 1.1  # where its bisection ends
 _NOISE_STEP = 1.03  # gamma fails and holds by so much above and below that of accepted noise
 
 Row = dict[str, Any]
@@ -141,7 +140,7 @@ def _find_margin(
     factor = FAILING_OVER_STATED_MARGIN * required
     held: list[Row] = []
     beyond: list[Row] = []
-    while stable < _MAX_MARGIN and failing > _MAX_FAILING_OVER_STABLE_MARGIN * stable:
+    while stable < _MAX_MARGIN and failing > FAILING_OVER_STATED_MARGIN * stable:
         tried = dataclasses.replace(settings, gamma=factor * settings.gamma)
         study = _study_of_settings(tried, hands, walls, repeats=2)
         rows = execute(f"margin_{factor:.6g}", study, trial)
