@@ -152,6 +152,14 @@ def test_options_refuse_impossible_numbers(capsys, option, number, says):
     assert err.endswith(f"'{option}': {says}\n")
 
 
+@pytest.mark.parametrize(
+    ("walls", "says"),
+    [("0.5,0", "0 is not above 0"), ("nan", "nan is not a finite number"), ("soft", "'soft' is")],
+)
+def test_invalid_wall_of_tune_names_the_option(capsys, walls, says):
+    assert f"'--walls': {says}" in run_main(capsys, "tune", "press", "--walls", walls)[2]
+
+
 @pytest.mark.parametrize("command", ["inspect", "run"])
 def test_a_command_that_fails_leaves_no_empty_folder(capsys, tmp_path, command):
     there, out = tmp_path / "there", tmp_path / "new" / "inner"

@@ -616,7 +616,9 @@ def compare_passivity(
 @click.option(
     "--hands", type=option.NAMES_TYPE, help="Grips of the operator.  [default: light,firm]"
 )
-@click.option("--walls", type=option.NAMES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option(
+    "--walls", type=option.POSITIVES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]"
+)
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
@@ -632,7 +634,7 @@ def tune(
     scenario: str,
     out: Path,
     hands: tuple[str, ...] | None,
-    walls: tuple[str, ...] | None,
+    walls: tuple[float, ...] | None,
     **options: Any,
 ) -> None:
     """Choose passivity method and force scales for a station.
@@ -643,8 +645,8 @@ def tune(
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
-    stiffness = [option.POSITIVE_TYPE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
-    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffness, **options)
+    hands, walls = hands or ("light", "firm"), walls or (0.5, 20.0)
+    tune_station(scenario, out, hands=hands, walls=walls, **options)
 
 
 @cli.command()
