@@ -151,6 +151,8 @@ def drive(
     """
     options["browser"] = not no_browser
     if study is None:
+        names = ("results", "participant", "simulated")
+        option.refuse_given_options(*names, remedy="add --study or remove it")
         from drake_teleop.live.server import run_drive_command
 
         run_drive_command(scenario, record=record, **options)
@@ -524,6 +526,9 @@ def export(
     """
     from drake_teleop.load.identification import Identification
 
+    if to not in _CONTROLLER_FORMATS:
+        remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
+        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "largest", remedy=remedy)
     found = Identification.load(identification)
     if to in _CONTROLLER_FORMATS:
         from drake_teleop.robots.controller.export import export_controller
