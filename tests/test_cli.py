@@ -152,6 +152,31 @@ def test_options_refuse_impossible_numbers(capsys, option, number, says):
     assert err.endswith(f"'{option}': {says}\n")
 
 
+@pytest.mark.parametrize(
+    ("walls", "says"),
+    [("0.5,0", "0 is not above 0"), ("nan", "nan is not a finite number"), ("soft", "'soft' is")],
+)
+def test_invalid_wall_of_tune_names_the_option(capsys, walls, says):
+    assert f"'--walls': {says}" in run_main(capsys, "tune", "press", "--walls", walls)[2]
+
+
+@pytest.mark.parametrize("option", ["--results", "--participant", "--simulated"])
+def test_option_of_an_experiment_requires_one(capsys, option):
+    assert run_main(capsys, "drive", "press", option, "3")[::2] == (
+        2,
+        f"error: {option}: has no effect here; add --study or remove it\n",
+    )
+
+
+@pytest.mark.parametrize(
+    "option", [("--out", "x"), ("--rate", "3"), ("--cutoff", "30"), ("--range", "3", "4")]
+)
+def test_printed_export_refuses_options_of_a_controller(capsys, option):
+    status, _, err = run_main(capsys, "export", "load.json", "--to", "ur", *option)
+    assert status == 2
+    assert err.startswith(f"error: {option[0]}: has no effect here; remove it, as ur is printed")
+
+
 @pytest.mark.parametrize("command", ["inspect", "run"])
 def test_a_command_that_fails_leaves_no_empty_folder(capsys, tmp_path, command):
     there, out = tmp_path / "there", tmp_path / "new" / "inner"

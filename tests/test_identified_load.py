@@ -143,6 +143,23 @@ def test_edited_included_model_changes_the_cache_key(identifications, tmp_path):
         assert np.isclose(NominalSlave(scenario.slave).arm.phi_load[0], mass)
 
 
+def test_edited_mesh_of_mjcf_tool_changes_the_cache_key(identifications, tmp_path):
+    (tmp_path / "meshes").mkdir()
+    tool = tmp_path / "tool.xml"
+    tool.write_text(
+        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="a" file="a.obj"/></asset>'
+        '<worldbody><body><geom type="mesh" mesh="a"/></body></worldbody></mujoco>'
+    )
+    scenario, masses = replace(Scenario(), slave__tool=Tool(model=str(tool))), []
+    for z in (0.1, 0.2):
+        corners = f"v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 {z}\n"
+        (tmp_path / "meshes/a.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+        assert not identified_load(scenario).from_cache
+        assert identified_load(scenario).from_cache
+        masses.append(NominalSlave(scenario.slave).arm.phi_load[0])
+    assert np.isclose(masses[1], 2 * masses[0])
+
+
 def damaged(content: bytes) -> dict[str, bytes]:
     middle = content.index(b"load.phi") + 200
     flipped = bytearray(content)

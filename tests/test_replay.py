@@ -175,6 +175,22 @@ def test_all_logs_of_a_folder_are_replayed(tmp_path, scenario, result, monkeypat
         replay_command(tmp_path / "logs" / "without_scenario.parquet", tmp_path / "out")
 
 
+def test_replay_does_not_replace_the_summary_of_the_run(tmp_path, scenario, result):
+    reproduced, run = tmp_path / "reproduced", tmp_path / "run"
+    for log in (reproduced / "logs" / "log.parquet", run / "log.parquet"):
+        result.write_part(log, 0)
+        write_scenario(log.with_suffix(".yaml"), scenario)
+    cases = ((run, run), (run / "log.parquet", run), (reproduced, reproduced))
+    for given, folder in (*cases, (reproduced, reproduced / "logs")):
+        summary = folder / "summary.json"
+        summary.write_text("{}")
+        with pytest.raises(
+            DrakeTeleopError, match=r"contains the input summary\.json, .* another --out"
+        ):
+            replay_command(given, folder)
+        assert summary.read_text() == "{}" and not (folder / "replay.html").exists()
+
+
 def test_folder_without_run_is_rejected(tmp_path, scenario, result):
     with pytest.raises(DrakeTeleopError, match=r"contains no log of a run; give .* a study"):
         replay_command(tmp_path, tmp_path)

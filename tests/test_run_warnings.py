@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.identification import slave_arm, true_load
@@ -139,6 +140,29 @@ def test_only_the_planted_condition_is_reported(name, change, said):
 )
 def test_short_or_small_deviations_are_not_reported(name, change):
     assert run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM) == []
+
+
+def without_network(force):
+    result = recorded(force_to_master=(slice(0, 3), force))
+    names = [name for name in result.signals if name != "ports"]
+    signals = {name: result[name] for name in names}
+    return SimulationResult(T, signals, [SIGNALS[name] for name in names])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.08])
+def test_force_that_oscillates_at_rest_without_network_is_reported(noise):
+    force = noise * np.random.default_rng(4).normal(size=(len(T), 3))
+    force[:, 2] += 0.25 * np.sin(2 * np.pi * 62 * T) * during(2, 3)
+    (warning,) = run_warnings(without_network(force), Scenario(), ARM)
+    assert "rendered force oscillates at 62 Hz" in warning
+    assert "force_scale)" in warning and "ledger" not in warning
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_of_the_force_at_rest_is_no_oscillation(seed):
+    noise = 0.1 * np.random.default_rng(seed).normal(size=(len(T), 3))
+    for force in (noise, gaussian_filter1d(3 * noise, 3, axis=0)):
+        assert run_warnings(without_network(force), Scenario(), ARM) == []
 
 
 def test_normal_run_has_no_warnings():

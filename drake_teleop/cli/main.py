@@ -151,6 +151,8 @@ def drive(
     """
     options["browser"] = not no_browser
     if study is None:
+        names = ("results", "participant", "simulated")
+        option.refuse_given_options(*names, remedy="add --study or remove it")
         from drake_teleop.live.server import run_drive_command
 
         run_drive_command(scenario, record=record, **options)
@@ -524,6 +526,9 @@ def export(
     """
     from drake_teleop.load.identification import Identification
 
+    if to not in _CONTROLLER_FORMATS:
+        remedy = f"remove it, as {to} is printed; for a file, redirect the output: > FILE"
+        option.refuse_given_options("out", "rate_hz", "cutoff_hz", "largest", remedy=remedy)
     found = Identification.load(identification)
     if to in _CONTROLLER_FORMATS:
         from drake_teleop.robots.controller.export import export_controller
@@ -616,7 +621,9 @@ def compare_passivity(
 @click.option(
     "--hands", type=option.NAMES_TYPE, help="Grips of the operator.  [default: light,firm]"
 )
-@click.option("--walls", type=option.NAMES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option(
+    "--walls", type=option.POSITIVES_TYPE, help="Wall stiffnesses [kN/m].  [default: 0.5,20]"
+)
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
@@ -632,7 +639,7 @@ def tune(
     scenario: str,
     out: Path,
     hands: tuple[str, ...] | None,
-    walls: tuple[str, ...] | None,
+    walls: tuple[float, ...] | None,
     **options: Any,
 ) -> None:
     """Choose passivity method and force scales for a station.
@@ -643,8 +650,8 @@ def tune(
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
-    stiffness = [option.POSITIVE_TYPE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
-    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffness, **options)
+    hands, walls = hands or ("light", "firm"), walls or (0.5, 20.0)
+    tune_station(scenario, out, hands=hands, walls=walls, **options)
 
 
 @cli.command()

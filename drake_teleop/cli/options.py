@@ -239,6 +239,15 @@ free_motion_log = click.option(
 )
 
 
+def refuse_given_options(*names: str, remedy: str) -> None:
+    """Raise DrakeTeleopError if the command line has one of these options, which has no effect."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        source = context.get_parameter_source(str(parameter.name))
+        if parameter.name in names and source is click.core.ParameterSource.COMMANDLINE:
+            raise DrakeTeleopError("has no effect here", where=parameter.opts[0], remedy=remedy)
+
+
 def confirm_at_terminal(question: str) -> bool:
     """Return the answer of a user at a terminal, True for yes; False without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)

@@ -13,22 +13,29 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 Array: TypeAlias = NDArray[np.float64]
 _Record = TypeVar("_Record", bound=Any)
+MAX_ARRAY_VALUE = 1e30
+"""Largest absolute value in an input array, in any unit; its eighth power must not overflow."""
 
 
 def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
-    """Return a finite float64 array of this shape; `leading` allows more dimensions in front."""
+    """Return a float64 array of this shape with finite values up to `MAX_ARRAY_VALUE`.
+
+    `leading` allows more dimensions in front.
+    """
     expected = ", ".join(["..."] * leading + [str(n) for n in shape])
     expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
     array = float_array(name, value, f"give an array of shape {expected}")
     actual = array.shape[array.ndim - len(shape) :] if leading else array.shape
     if actual != shape:
         raise DrakeTeleopError(f"has shape {array.shape} instead of {expected}", where=name)
-    finite = np.isfinite(array)
-    if not finite.all():
-        first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        raise DrakeTeleopError(
-            f"is not finite at index {first}", where=name, remedy="replace NaN and infinity"
-        )
+    valid = np.abs(array) <= MAX_ARRAY_VALUE  # False for NaN
+    if not valid.all():
+        first = tuple(int(i) for i in np.argwhere(~valid)[0])
+        what, remedy = f"is not finite at index {first}", "replace NaN and infinity"
+        if np.isfinite(array[first]):
+            what = f"is {array[first]:g} at index {first}, outside +-{MAX_ARRAY_VALUE:g}"
+            remedy = "correct the value or its unit"
+        raise DrakeTeleopError(what, where=name, remedy=remedy)
     return array
 
 
@@ -99,11 +106,12 @@ def check_nonzero_load(name: str, phi: Array) -> Array:
 
 
 def positive_array(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return an array as `finite_array`; raise DrakeTeleopError unless all values are positive."""
+    """Return an array as `finite_array`; its values are positive, and so are their inverses."""
     array = finite_array(name, value, *shape)
-    if not (array > 0.0).all():
+    if not (array >= 1.0 / MAX_ARRAY_VALUE).all():
+        kind = "not positive" if (array <= 0.0).any() else f"below {1.0 / MAX_ARRAY_VALUE:g}"
         raise DrakeTeleopError(
-            f"has the value {array.min():g}, which is not positive",
+            f"has the value {array.min():g}, which is {kind}",
             where=name,
             remedy="give values above 0",
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -240,7 +241,8 @@ def read_inputs(
 
 
 def _not_repeatable_error(what: str, path: Path) -> DrakeTeleopError:
-    remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {path.parent}"
+    folder = shlex.quote(str(path.parent))
+    remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 

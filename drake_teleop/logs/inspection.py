@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ MIN_REPEATED_ROW_SHARE = 0.05
 MIN_REPEATED_BLOCK_ROWS = 5
 _MAX_DRAFT_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
+_CHECKSUM_LINE_START = "# `inspect` replaces this file only if it is unchanged: "
 _CANONICAL_WRENCH_COLUMNS = {"f_x", "tau_x"}
 _INSPECTED_QUANTITIES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
@@ -46,7 +48,8 @@ def inspect_command(
     """Inspect a canonical log, a log description, any table or a bag; return the summary.
 
     Write summary.json into the folder `out`. For unknown tables and bags also write draft.yaml: a
-    description of `log` and `others` (files of the same recording) that fits the data.
+    description of `log` and `others` (files of the same recording) that fits the data. A draft
+    that the user changed is kept; the new one is draft-2.yaml, draft-3.yaml, ...
     """
     summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
     summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
@@ -62,7 +65,7 @@ def inspect_command(
     else:
         drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
-            _write_draft(join_drafts(drafts), out / "draft.yaml", summary)
+            _write_draft(join_drafts(drafts), _free_draft_path(out), summary)
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -106,8 +109,24 @@ def _are_column_names_numbers(names: Sequence[str]) -> bool:
     return False
 
 
+def _free_draft_path(out: Path) -> Path:
+    names = ("draft.yaml", *(f"draft-{k}.yaml" for k in range(2, 1000)))
+    return next(path for path in map(out.joinpath, names) if _is_no_users_text(path))
+
+
+def _is_no_users_text(path: Path) -> bool:
+    if not path.exists():
+        return True
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return _with_checksum(text.rpartition(_CHECKSUM_LINE_START)[0]) == text
+
+
+def _with_checksum(text: str) -> str:
+    return f"{text}{_CHECKSUM_LINE_START}{sha256(text.encode()).hexdigest()[:16]}\n"
+
+
 def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
-    write_text(path, draft.text())
+    write_text(path, _with_checksum(draft.text()))
     summary["draft"] = str(path)
     places = ", ".join(_places_to_fill_in(draft.streams))
     lacking = [f"places that were not recognized: FILL IN {places}"] if places else []
@@ -116,13 +135,14 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
     if not lacking:
-        write_text(path, _correct_draft_by_data(draft, path, summary).text())
+        draft = _correct_draft_by_data(draft, path, summary)
+        write_text(path, _with_checksum(draft.text()))
         return
     text = draft.text()
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
         text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
-    write_text(path, text)
+    write_text(path, _with_checksum(text))
 
 
 def _places_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
@@ -143,7 +163,7 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         if finding is None:
             break
         draft = draft.with_finding_corrected(finding)
-        write_text(path, draft.text())
+        write_text(path, _with_checksum(draft.text()))
     return draft
 
 

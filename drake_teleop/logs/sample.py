@@ -5,6 +5,7 @@ free.yaml is free motion, touched.yaml has contacts, truth.json the true values.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,14 +167,17 @@ def _true_contact(touch: FingertipPush) -> dict[str, Any]:
 def _print_summary(out: Path) -> None:
     from rich.console import Console
 
-    load = "out/load/identification.json"
+    load, free, touched = (
+        "out/load/identification.json",
+        *(shlex.quote(f"{out}/{name}.yaml") for name in ("free", "touched")),
+    )
     for line in (
         f"a gripper in free motion ({out}/free.yaml) and touched three times ({out}/touched.yaml)",
         "try:",
-        f"  drake-teleop inspect {out}/free.yaml",
-        f"  drake-teleop identify {out}/free.yaml --out out/load",
-        f"  drake-teleop eliminate {out}/touched.yaml --load {load}",
-        f"  drake-teleop detect {out}/touched.yaml --load {load} --free {out}/free.yaml",
+        f"  drake-teleop inspect {free}",
+        f"  drake-teleop identify {free} --out out/load",
+        f"  drake-teleop eliminate {touched} --load {load}",
+        f"  drake-teleop detect {touched} --load {load} --free {free}",
         f"the true values are in {out}/truth.json",
     ):
         Console(soft_wrap=True).print(line, highlight=False, markup=False)

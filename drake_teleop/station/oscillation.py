@@ -123,6 +123,18 @@ def high_pass_above_5_hz(t: Array, signal: Array) -> Array:
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")
 
 
+def dominant_frequency(t: Array, signal: Array) -> tuple[float, float]:
+    """Return the strongest frequency [Hz] of `signal` (N, k), and the share of power within 25 %.
+
+    `t` are evenly spaced times [s].
+    """
+    spectrum = np.fft.rfft(signal * np.hanning(len(signal))[:, np.newaxis], axis=0)
+    power, k = (np.abs(spectrum) ** 2).sum(axis=1), np.arange(len(spectrum))
+    near = np.abs(k - power.argmax()) <= 0.25 * power.argmax() + 1
+    frequency = float(power.argmax() / (len(signal) * (t[1] - t[0])))
+    return frequency, float(power[near].sum() / power.sum())
+
+
 class Chatter(NamedTuple):
     """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
 

@@ -16,7 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import models_dir, output_folder, write_json
+from drake_teleop.common.files import check_inputs_are_kept, models_dir, output_folder, write_json
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
@@ -77,6 +77,8 @@ def replay_command(
         scenario: shipped scenario or YAML file; by default the YAML file beside the log.
     """
     logs = _find_logs(run)
+    for folder in {run, *(log.parent for log in logs)}:
+        check_inputs_are_kept(out / "summary.json", folder / "summary.json")
     films = []
     with output_folder(out):
         for log in logs:

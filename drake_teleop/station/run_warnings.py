@@ -19,6 +19,7 @@ from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
     MAX_FORCE_RIPPLE_AT_REST_N,
     MAX_REVERSAL_DELAY_S,
+    dominant_frequency,
     find_chatter,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
@@ -58,6 +59,8 @@ _NUM_POSITION_LOOP_TIME_CONSTANTS = 6.0
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
 _MIN_FORCE_OSCILLATION_CYCLES = 4
+# Smallest share of an oscillation's power near its frequency; white noise has less than 0.3.
+_MIN_POWER_SHARE_OF_OSCILLATION = 0.5
 # Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_SPANS = 3
 
@@ -294,7 +297,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
 
 
 def _check_rendered_force(result: SimulationResult) -> Warnings:
-    if not {"ports", "intent", "force_to_master"} <= set(result.signals):
+    if not {"intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
     force = high_pass_above_5_hz(t, result["force_to_master"][:, :3])
@@ -312,10 +315,15 @@ def _check_rendered_force(result: SimulationResult) -> Warnings:
     crossings = np.count_nonzero(np.diff(np.signbit(strongest)))
     if crossings < 2 * _MIN_FORCE_OSCILLATION_CYCLES:  # a step is no oscillation
         return
+    over_network = "ports" in result
+    frequency, share = dominant_frequency(t, part)
+    if not over_network and share < _MIN_POWER_SHARE_OF_OSCILLATION:
+        return  # noise of the sensor
+    ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""
     yield (
-        f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
+        f"the rendered force oscillates at {frequency:.2g} Hz with up to"
         f" {_maximum_within_spans(t, rms, spans):.2g} N rms while the hand rests (reduce"
-        " force_scaling.gamma or force_scale, or increase passivity.ledger.initial with ledger),",
+        f" force_scaling.gamma or force_scale{ledger}),",
         spans,
     )
 

@@ -159,6 +159,7 @@ class Scenario:
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         check_ranges(self, where)
+        self.operator.check(f"{where}:operator")
         self.passivity.check(f"{where}:passivity")
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")

@@ -124,7 +124,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     monkeypatch.setattr(
         study, "_run_in_processes", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
     )
-    study._run_station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
+    study._run_station_study(study.base_scenario(mine, 3), ["lan"], ["none"], 1, lambda name: None)
     base = bases[0]
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
         0.3,
@@ -166,3 +166,10 @@ def test_preset_networks_have_the_known_delays():
 def test_longest_round_trip_is_below_the_first_unstable_one():
     assert study.longest_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
     assert study.longest_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0]) == 0.0
+
+
+def test_missing_scenario_is_an_error_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "_run_one_dof_study", lambda *_: pytest.fail("the work begins"))
+    with pytest.raises(DrakeTeleopError, match="there is no scenario 'nope'"):
+        study.compare_command(tmp_path / "out", scenario="nope", quiet=True)
+    assert not (tmp_path / "out").exists()

@@ -343,6 +343,23 @@ def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"max_sensor_norms": np.ones(4)}, r"the best uses .* of the sensor limit \(.*--payload"),
+        (
+            {"acceleration": np.full(6, 1e-6)},
+            "within all limits does not excite all parameters; it uses",
+        ),
+    ],
+)
+def test_limits_without_a_useful_motion_are_an_error_with_the_limit(slave, limits, said):
+    robot = dataclasses.replace(slave, limits=slave.limits._replace(**limits))
+    with pytest.raises(DrakeTeleopError, match=said):
+        excite(robot, harmonics=2, starts=1)
+
+
 @pytest.mark.long
 @pytest.mark.slow
 def test_identification_refuses_an_unsuitable_trajectory(short):

@@ -491,3 +491,19 @@ def test_covariance_of_drifting_offsets_is_a_double_sum():
 def test_negative_random_walk_is_refused():
     with pytest.raises(DrakeTeleopError, match=r"noise\.walk: has the negative value -"):
         NoiseStd(walk=[-1.0] * 12)
+
+
+@pytest.mark.parametrize("value", [1e300, -1.1e30])
+@pytest.mark.parametrize("index", range(4))
+def test_too_large_values_are_an_error_with_their_index(value, index):
+    """The products of larger values overflow, and the eigenvalues of the Gram matrix fail."""
+    rng = np.random.default_rng(0)
+    motion = [rng.normal(size=(50, 3)) for _ in range(3)]
+    arrays = [non_contact_wrench(*motion, TOOL), *motion]
+    arrays[index] = np.array(arrays[index])
+    arrays[index][7, 2] = value
+    name = ("wrench", "s", "omega", "alpha")[index]
+    with pytest.raises(DrakeTeleopError, match=rf"^{name}: is -?1\S* at index \(7, 2\), outside"):
+        identify(*arrays)
+    arrays[index][7, 2] = np.copysign(1e30, value)
+    assert np.isfinite(identify(*arrays).mass)

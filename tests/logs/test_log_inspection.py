@@ -421,3 +421,29 @@ def test_constant_wrench_is_named(tmp_path: Path, streams: dict[str, bool]) -> N
     columns = good()
     columns["force"][:], columns["torque"][:] = 1.0, 0.1
     assert set(findings(tmp_path, columns, **streams)) == {"dead channel"}
+
+
+def test_edited_draft_is_kept(tmp_path: Path) -> None:
+    """An unchanged draft is replaced, also by that of another table."""
+    c = good()
+    data = {"t": c["t"]}
+    for key, x in (("F", c["force"]), ("T", c["torque"]), ("acc_", c["s"]), ("w", c["omega"])):
+        data |= {f"{key}{axis}": x[:, i] for i, axis in enumerate("xyz")}
+    pl.DataFrame(data).write_csv(tmp_path / "a.csv")
+    pl.DataFrame(data).head(100).write_csv(tmp_path / "b.csv")
+    for table in ("a.csv", "b.csv", "b.csv"):
+        summary = inspect_command(tmp_path / table, tmp_path / "out", quiet=True)
+        assert summary["draft"] == str(tmp_path / "out/draft.yaml")
+        assert table in (tmp_path / "out/draft.yaml").read_text()
+    for name in ("draft", "draft-2"):
+        path = tmp_path / f"out/{name}.yaml"
+        path.write_text(path.read_text().replace("unit: N\n", "unit: kN\n") + "# mine\n")
+        edited = path.read_text()
+        summary = inspect_command(tmp_path / "a.csv", tmp_path / "out", quiet=True)
+        assert summary["draft"] != str(path) and load_description(summary["draft"]).wrench
+        assert path.read_text() == edited
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.yaml")) == [
+        "draft-2.yaml",
+        "draft-3.yaml",
+        "draft.yaml",
+    ]

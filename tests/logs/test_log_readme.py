@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -105,3 +106,11 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     other = bytes_of(tmp_path)
     same = {name for name in shipped if other[name] == shipped[name]}
     assert same == {"free.yaml", "touched.yaml", "truth.json"}
+
+
+def test_printed_commands_name_files_of_any_folder(tmp_path, capsys):
+    sample_log_command(tmp_path / "a b", quiet=False)
+    lines = [line for line in capsys.readouterr().out.splitlines() if "  drake-teleop" in line]
+    words = [word for line in lines for word in shlex.split(line) if word.startswith(str(tmp_path))]
+    assert len(lines) == 4 and len(words) == 5
+    assert all(Path(word).is_file() for word in words)

@@ -16,6 +16,7 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import device, phantom
 from drake_teleop.station.master.data_sheets import JointFriction, Master
 from drake_teleop.station.master.force_display import ForceDisplay
@@ -27,6 +28,7 @@ from drake_teleop.station.operator.operator import (
     Sine,
     hand_wrench_into,
 )
+from drake_teleop.station.scenario import Scenario
 
 START = arrays.forward_kinematics(phantom.HOME_POSTURE_RAD)
 SEGMENTS = [
@@ -206,6 +208,16 @@ def test_intent_loads_from_yaml():
         MinimumJerk(duration=2.0, translation=[0.0, 0.0, 0.1]),
         Sine(frequency=3.0, rotation=[0.0, 0.2, 0.0]),
     ]
+
+
+def test_ramps_longer_than_the_oscillation_are_an_error():
+    segments = [MinimumJerk(), Sine(duration=0.4, ramp=0.2), Sine(duration=0.4, ramp=0.21)]
+    with pytest.raises(
+        DrakeTeleopError,
+        match=r"operator\.intent\[2\]\.ramp: two ramps of 0\.21 s .* 0\.4 s; set it to 0\.2 or",
+    ):
+        Scenario(operator=OperatorConfig(intent=segments)).check()
+    Scenario(operator=OperatorConfig(intent=segments[:2])).check()
 
 
 def test_grips_in_docs_equal_the_code():

@@ -15,7 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model import model_references
-from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_references import ModelFiles, list_model_files
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
 SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
@@ -374,3 +374,47 @@ def test_files_inside_are_read_from_any_working_folder(
         d_xml=mjcf(f'<compiler meshdir="parts"/>{asset}'),
     )
     assert parse(path).sensor_frame.name() == "l"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "mesh"),
+    [
+        ("r.urdf", urdf("meshes/a.obj"), "meshes/a.obj"),
+        ("r.urdf", urdf("package://parts/a.obj"), "parts/a.obj"),
+        ("r.sdf", including("inner.urdf"), "meshes/a.obj"),
+        (
+            "r.xml",
+            mjcf('<compiler meshdir="meshes"/><asset><mesh file="a.obj"/></asset>'),
+            "meshes/a.obj",
+        ),
+        (
+            "r.xml",
+            mjcf(
+                '<compiler assetdir="meshes" strippath="true"/>'
+                r'<asset><mesh file="C:\x\a.obj"/></asset>'
+            ),
+            "meshes/a.obj",
+        ),
+        ("r.xml", mjcf('<compiler meshdir="meshes"/><include file="inner.xml"/>'), "meshes/a.obj"),
+    ],
+)
+def test_listed_files_contain_meshes_and_their_parts(tmp_path, name, text, mesh):
+    (tmp_path / "inner.urdf").write_text(urdf("meshes/a.obj"))
+    (tmp_path / "inner.xml").write_text(
+        "<mujocoinclude><asset><mesh file='a.obj'/></asset></mujocoinclude>"
+    )
+    (tmp_path / name).write_text(text)
+    file = tmp_path / mesh
+    file.parent.mkdir()
+    file.write_text(f"mtllib a.mtl\n{SOLID}")
+    file.with_suffix(".mtl").write_text("newmtl m\n")
+    packages = (tmp_path / "parts",) if file.parent.name == "parts" else ()
+    listed = list_model_files(tmp_path / name, packages)
+    assert {tmp_path / name, file, file.with_suffix(".mtl")} <= set(listed)
+
+
+def test_listed_files_contain_no_mesh_outside_folder(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "a.obj").write_text(SOLID)
+    (tmp_path / "in" / "r.urdf").write_text(urdf("../a.obj"))
+    assert list_model_files(tmp_path / "in" / "r.urdf", ()) == [tmp_path / "in" / "r.urdf"]

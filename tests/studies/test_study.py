@@ -718,6 +718,31 @@ def test_paths_of_the_scenario_are_relative_to_its_file(tmp_path):
     assert read == [str(tmp_path / name) for name in names]
 
 
+def test_edited_file_of_a_factor_is_another_study(tmp_path, monkeypatch):
+    """The scenario contains the other tool; the mesh is in a package of the scenario."""
+    (tmp_path / "parts").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.sdf").write_text(
+            f'<sdf version="1.9"><model name="{name}"><link name="body"><inertial><mass>1</mass>'
+            "</inertial><visual name='v'><geometry><mesh><uri>package://parts/a.obj</uri></mesh>"
+            "</geometry></visual></link></model></sdf>"
+        )
+    (tmp_path / "parts/a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "tiny.yaml").write_text(
+        f"{SCENARIO}slave: {{tool: {{model: a.sdf}}, package_paths: [parts]}}\n"
+    )
+    (tmp_path / "study.yaml").write_text(
+        "scenario: tiny.yaml\nfactors: [{field: slave.tool.model, words: [a.sdf, b.sdf]}]\n"
+    )
+    seen = []
+    monkeypatch.setattr(studies, "run_study", lambda *a, **_: seen.append(a[3]["files"]) or 1 / 0)
+    for edited in ("tiny.yaml", "b.sdf", "parts/a.obj"):
+        (tmp_path / edited).write_text((tmp_path / edited).read_text() + "\n")
+        with pytest.raises(ZeroDivisionError):
+            study_command(tmp_path / "study.yaml", tmp_path / "out", quiet=True)
+    assert seen[0] != seen[1] != seen[2]
+
+
 def test_missing_study_file_is_an_error(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"none\.yaml'; give a YAML file or one of scaling_"):
         LoadStudy(tmp_path / "none.yaml")

@@ -64,6 +64,13 @@ def test_invalid_sets_are_refused(arguments, where):
         make_stated_set(*arguments)
 
 
+@pytest.mark.parametrize("network", [None, "ideal"])
+def test_scenario_without_network_is_refused_before_the_runs(tmp_path, network):
+    with pytest.raises(DrakeTeleopError, match=r"^network: .* neither .*; choose among lan, wan"):
+        tune("press", tmp_path / "out", network=network)
+    assert not (tmp_path / "out").exists()
+
+
 def test_unknown_networks_are_refused():
     with pytest.raises(DrakeTeleopError, match=r"^network: 'internt' is unknown"):
         without_task_and_method(LoadScenario("touch"), "internt")

@@ -93,11 +93,12 @@ def compare_command(
     methods = tuple(METHODS) if methods is None else methods
     for name in methods:
         METHODS.check(name, "methods")
-    make_folder(out)  # before the work, so that a bad path fails early
+    base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
+    make_folder(out)
     with show_progress(progress and not quiet) as stage:
         limits = _run_one_dof_study(methods, seed, jobs, stage)
         released = _run_release_study(networks, methods, seed, jobs, stage)
-        runs, traces = _run_station_study(scenario, networks, methods, seed, jobs, stage)
+        runs, traces = _run_station_study(base, networks, methods, jobs, stage)
         covering = _run_injected_energy_study(stage)
     summary = {
         "networks": list(networks),
@@ -255,14 +256,12 @@ def _run_release_study(
 
 
 def _run_station_study(
-    scenario: str | Path,
+    base: Scenario,
     networks: Sequence[str],
     methods: Sequence[str],
-    seed: int,
     jobs: int,
     stage: StartStage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, Array]]]:
-    base = base_scenario(scenario, seed)
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)

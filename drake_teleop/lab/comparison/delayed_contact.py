@@ -59,7 +59,7 @@ def delayed_contact(
     swing = Sine(
         t_start=settle + task.swing_start,
         duration=task.swing_end - task.swing_start,
-        ramp=0.5,
+        ramp=min(0.5, 0.5 * (task.swing_end - task.swing_start)),
         frequency=1.5,
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],

@@ -40,6 +40,12 @@ _CONVEX_HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
     " touch in its start posture are ignored"
 )
+_LIGHTER_LOAD_ADVICE = "; or a smaller --payload, or another sensor or start"
+_ADVICE_BY_LIMIT = {
+    "clearance": _CONVEX_HULL_ADVICE,
+    "sensor": _LIGHTER_LOAD_ADVICE,
+    "torque": _LIGHTER_LOAD_ADVICE,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +106,15 @@ def excite(
         report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
         small = _shrinking_motions_at_start(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
-    return assemble_excitation(robot, criterion, found, trajectory, uses)
+    excitation = assemble_excitation(robot, criterion, found, trajectory, uses)
+    if not np.isfinite(excitation.values[criterion]):
+        raise DrakeTeleopError(
+            "the largest motion that was found within all limits does not excite all parameters;"
+            f" it uses {uses[0]}",
+            where=robot.name,
+            remedy="raise this limit, or take more time, a longer period or another seed",
+        )
+    return excitation
 
 
 def assemble_excitation(
@@ -152,7 +166,7 @@ def find_best_within_limits(
         + (f": the best uses {worst}" if worst else ""),
         where=robot.name,
         remedy="take more time, a longer period or another seed"
-        + (_CONVEX_HULL_ADVICE if worst is not None and worst.limit_name == "clearance" else ""),
+        + (_ADVICE_BY_LIMIT.get(worst.limit_name, "") if worst is not None else ""),
     )
 
 
@@ -208,6 +222,7 @@ def _shrinking_motions_at_start(
             # The last use is that of capsules; `check_trajectory` measures the true clearance.
             if _largest_limit_uses(robot, small)[:-1].max() <= 1:
                 yield small
+    yield replace(motions[-1].with_scaled_amplitudes(0.0), q0=robot.home_posture)  # rest
 
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:

@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop.common.config import check_ranges
+from drake_teleop.common.config import check_ranges, with_absolute_paths
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
@@ -103,13 +103,16 @@ def study_command(
     data, where = ReadScenarioData(study.scenario if known else path.parent / study.scenario)
     scenario = ScenarioFromData(data, where)
     files = [*scenario.slave.model_files(), *referenced_files(scenario)]
-    digests = [sha256(file.read_bytes()).hexdigest() for file in files]
+    packages = {"slave": {"package_paths": scenario.slave.package_paths}}
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _set_scenario_fields({}, {factor.field: value})
+            changed = _set_scenario_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
-            check_ranges(settings_from_data(Scenario, changed, place), place)
+            config = settings_from_data(Scenario, changed, place)
+            check_ranges(config, place)
+            files += referenced_files(with_absolute_paths(config, Path(where).parent))
+    digests = [sha256(file.read_bytes()).hexdigest() for file in dict.fromkeys(files)]
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(

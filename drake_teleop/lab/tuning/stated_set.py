@@ -116,12 +116,20 @@ def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario
     if network is not None and network not in PRESETS:
         remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
+    channel = scenario.channel if network is None else Channel(network=network)
+    if replace(scenario, channel=channel).has_no_network_or_passivity:
+        raise DrakeTeleopError(
+            "the scenario has neither network nor passivity method, which the energy balances of"
+            " the runs need",
+            where="network",
+            remedy=f"choose among {', '.join(name for name in PRESETS if name != 'ideal')}",
+        )
     scaling = scenario.force_scaling
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
     return replace(
         scenario.without_environment(),
         simulation=simulation,
-        channel=scenario.channel if network is None else Channel(network=network),
+        channel=channel,
         passivity=PassivityConfig(),
         force_scaling=ForceScalingConfig(sigma=0.0, force_scale=scaling.force_scale),
         contact_detection=None,

@@ -104,6 +104,17 @@ class OperatorConfig:
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)
 
+    def check(self, where: str) -> None:
+        """Raise a DrakeTeleopError if the ramps of an oscillation are longer than its duration."""
+        for index, segment in enumerate(self.intent):
+            if isinstance(segment, Sine) and segment.ramp > 0.5 * segment.duration:
+                raise DrakeTeleopError(
+                    f"two ramps of {segment.ramp:g} s are longer than the duration,"
+                    f" {segment.duration:g} s",
+                    where=f"{where}.intent[{index}].ramp",
+                    remedy=f"set it to {0.5 * segment.duration:g} or less, or a longer duration",
+                )
+
     @property
     def hand(self) -> HandImpedance:
         """Impedance of the hand for the configured grip."""
@@ -121,10 +132,9 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> Array:
         if isinstance(segment, MinimumJerk):
             row[:6] = segment.t_start, segment.duration, np.inf, 1.0, 0.0, 0.5 * np.pi
         else:
-            ramp = min(segment.ramp, 0.5 * segment.duration)
-            end = segment.t_start + segment.duration
+            stop = segment.t_start + segment.duration - segment.ramp
             speed = 2 * np.pi * segment.frequency
-            row[:6] = segment.t_start, ramp, end - ramp, ramp, speed, segment.phase
+            row[:6] = segment.t_start, segment.ramp, stop, segment.ramp, speed, segment.phase
         row[6:9] = segment.translation
         row[9:12] = segment.rotation
     return packed

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import silent_stderr
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_number
-from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS, ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
@@ -98,7 +98,7 @@ def _resolve_mesh_file(
     address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
     file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
-        return "meshes were not found (--package-path, slave.package_paths)"
+        return f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
     if fault := files.file_access_fault(file, "meshes"):
         return fault
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.model_references import PACKAGE_FOLDER_SETTINGS
 from drake_teleop.station.slave.model.triangles import (
     Triangles,
     check_triangle_vertices,
@@ -18,7 +19,7 @@ from drake_teleop.station.slave.model.triangles import (
     read_triangles,
 )
 
-_MESHES_NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
+_MESHES_NOT_FOUND_FAULT = f"meshes were not found ({PACKAGE_FOLDER_SETTINGS})"
 _MESHES_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 
 

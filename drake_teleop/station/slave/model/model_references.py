@@ -27,9 +27,12 @@ from drake_teleop.common.texts import read_yaml
 _MAX_MODEL_FILES, _MAX_MODEL_BYTES, _MAX_TEXT_FILE_BYTES = 2000, 500_000_000, 50_000_000
 _MAX_PATH_LENGTH = 4096
 _MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
+_XML_SUFFIXES = (".urdf", ".sdf", ".xml")
 _BINARY_SUFFIXES = set(
     [".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae"]
 )
+PACKAGE_FOLDER_SETTINGS = "--package-path, or package_paths in slave or master.leader"
+"""Places where users name the folders of packages, for messages."""
 _PACKAGE_FILE_NAME = "package.xml"
 _FILE_ATTRIBUTE_NAME_PATTERN = re.compile(
     r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z"
@@ -55,7 +58,7 @@ class ModelFiles:
                 raise DrakeTeleopError(
                     f"there is no folder {folder} for its packages",
                     where=str(model),
-                    remedy="correct slave.package_paths or --package-path",
+                    remedy=f"correct {PACKAGE_FOLDER_SETTINGS}",
                 )
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
@@ -109,7 +112,7 @@ class ModelFiles:
         if not self.may_read_file(path):
             return (
                 f"{kind} in {path.resolve().parent} are outside the model's folder and its packages"
-                " (name their folder: --package-path, slave.package_paths)"
+                f" (name their folder: {PACKAGE_FOLDER_SETTINGS})"
             )
         try:
             self.check_referenced_files(path)
@@ -134,7 +137,7 @@ class ModelFiles:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read_file(real):
             what = f"references {real}, which is outside the model's folder and its packages"
-            remedy = "move it there, or name its folder: --package-path, slave.package_paths"
+            remedy = f"move it there, or name its folder: {PACKAGE_FOLDER_SETTINGS}"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
         if real in including or len(including) > _MAX_INCLUDE_DEPTH:
             what = "includes itself" if real in including else "is nested too deeply"
@@ -154,13 +157,20 @@ class ModelFiles:
             self.sizes[real] = files, size
         return self.sizes[real]
 
-    def _referenced_files(self, path: Path) -> Iterator[Path]:
+    def mesh_files(self) -> Iterator[Path]:
+        """Yield the readable files of all links after `check_referenced_files(model)`."""
+        texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
+        for mesh in [mesh for path in texts for mesh in self._referenced_files(path, meshes=True)]:
+            if not self.file_access_fault(mesh, "meshes"):
+                yield from filter(os.path.isfile, self.sizes)
+
+    def _referenced_files(self, path: Path, *, meshes: bool = False) -> Iterator[Path]:
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
             tops.append(Path.cwd())  # Drake resolves nested includes from here
         folders = {top / base for top in tops for base in self._bases}
         try:
-            for address in self._addresses_in_file(path):
+            for address in _mesh_addresses(path) if meshes else self._addresses_in_file(path):
                 if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
@@ -176,12 +186,12 @@ class ModelFiles:
             yield from (
                 name for name in ("model.config", "manifest.xml") if (path / name).is_file()
             )
-        elif kind in (".urdf", ".sdf", ".xml", ".config"):
+        elif kind in (*_XML_SUFFIXES, ".config"):
             root = read_xml(path)
+            self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDER_ATTRIBUTES}
             if self._model.suffix.lower() == ".xml":  # `MeshLibrary` checks the assets
                 yield from (e.get("file", "") for e in root.iter("include"))
                 return
-            self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDER_ATTRIBUTES}
             yield from _addresses_in_xml(
                 root, meshes=path != self._model.resolve() or kind == ".xml"
             )
@@ -198,7 +208,7 @@ class ModelFiles:
 
 
 def list_model_files(model: Path, package_paths: tuple[Path, ...]) -> list[Path]:
-    """Return the model file and the files that it includes; none if it does not exist."""
+    """Return the model file, files that it includes and meshes; none if it does not exist."""
     if not os.path.isfile(model):
         return []
     try:
@@ -206,7 +216,7 @@ def list_model_files(model: Path, package_paths: tuple[Path, ...]) -> list[Path]
         files.check_referenced_files(model)
     except (DrakeTeleopError, OSError):  # the parser raises it again
         return [model]
-    return sorted(path for path in files.sizes if path.is_file())
+    return sorted({*filter(os.path.isfile, files.sizes), *files.mesh_files()})
 
 
 def _is_installed_python_package(folder: Path) -> bool:
@@ -254,6 +264,11 @@ def read_xml(path: Path) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"
         raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
+
+
+def _mesh_addresses(path: Path) -> Iterator[str]:
+    for address in _addresses_in_xml(read_xml(path), meshes=True):
+        yield from {address, re.split(r"[/\\]", address)[-1]}  # the name alone: strippath of MJCF
 
 
 def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:

@@ -6,7 +6,11 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.model_references import (
+    PACKAGE_FOLDER_SETTINGS,
+    ModelFiles,
+    read_xml,
+)
 from drake_teleop.station.slave.model.model_tree import link_of_frame
 from drake_teleop.station.slave.model.repair_report import (
     RepairedModel,
@@ -67,8 +71,7 @@ def _repair_included_file(
         raise DrakeTeleopError(
             f"includes {address!r}, which does not exist",
             where=str(file),
-            remedy="correct the path, or name its package's folder: --package-path,"
-            " slave.package_paths",
+            remedy=f"correct the path, or name its package's folder: {PACKAGE_FOLDER_SETTINGS}",
         )
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {_URDF_SUFFIX: repair_urdf, _SDF_SUFFIX: repair_sdf}.get(included.suffix.lower())
