@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -74,7 +72,6 @@ class Robot:
     sensor_noise: SensorNoise
     home_posture: Array
     assumptions: tuple[str, ...]
-    temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
@@ -85,10 +82,9 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         parsed = ParseSlave(plant, scenario.slave)
         if scenario.surroundings is not None:
             AddEnvironment(plant, scenario.surroundings)
-        folders.extend(parsed.mesh_folders)
         return parsed.instance, parsed.sensor_frame
 
-    slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
+    slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
     scene = CollisionScene(
         parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_count=not own
@@ -105,7 +101,6 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         points_S=np.array([np.zeros(3), slave.tip] if own else _TOOL_POINTS_IN_WORKSPACE_S),
         box=_UNLIMITED_BOX if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
-        folders=folders,
     )
 
 
@@ -125,12 +120,10 @@ def RobotFromModel(
     Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
     """
     missing: list[str] = []
-    folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
-        folders.append(model.mesh_folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
@@ -178,7 +171,6 @@ def RobotFromModel(
         points_S=np.zeros((1, 3)),
         box=_UNLIMITED_BOX,
         assumptions=assumptions + completed,
-        folders=folders,
     )
 
 
@@ -193,7 +185,6 @@ def _make_robot(
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
-    folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
@@ -241,5 +232,4 @@ def _make_robot(
         sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),
-        temporary_folders=tuple(folders),
     )

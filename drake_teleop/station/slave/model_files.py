@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import weakref
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 from pydrake.multibody.parsing import (
     FlattenModelDirectives,
@@ -36,23 +36,13 @@ _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
 _REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 
 
-class ModelInPlant(NamedTuple):
-    """Content of a model file that was added to a plant.
-
-    Attributes:
-        repaired: reports of the repair, with text "" if a part of the model was not repaired.
-        mesh_folder: folder of converted meshes, which Drake reads later.
-    """
-
-    instances: list[ModelInstanceIndex]
-    repaired: RepairedModel
-    mesh_folder: TemporaryDirectory[str]
-
-
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
-) -> ModelInPlant:
-    """Repair the text of a model file and parse it into a plant."""
+) -> tuple[list[ModelInstanceIndex], RepairedModel]:
+    """Repair the text of a model file, and parse it into a plant.
+
+    Return the added instances, and the repair, with text "" if a part was not repaired.
+    """
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -69,6 +59,7 @@ def repair_and_parse_model(
     files.add_packages_to_map(parser.package_map())
     files.check_referenced_files(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
+    weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
     forces = plant.num_force_elements()
     expected = SCENE_ERROR_TEXTS if purpose.is_scene else ROBOT_ERROR_TEXTS
     with translate_drake_errors(path, expected, folder.name):
@@ -80,7 +71,7 @@ def repair_and_parse_model(
         remedy = "remove them; only motors, gravity and contact move the arm"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     text = "".join(each.text for each in repaired) if all(e.text for e in repaired) else ""
-    return ModelInPlant(instances, merge_repaired_models(text, repaired), folder)
+    return instances, merge_repaired_models(text, repaired)
 
 
 def _add_repaired_file(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -29,21 +28,11 @@ from drake_teleop.station.slave.model_files import repair_and_parse_model
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Arm that was parsed into a plant; `mesh_folder` contains meshes, which Drake reads later."""
+    """Arm that was parsed into a plant."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
     assumptions: list[str]
-    mesh_folder: TemporaryDirectory[str]
-
-
-@dataclass(frozen=True)
-class ParsedTool:
-    """Tool that was parsed into a plant; `body` is welded to the sensor frame."""
-
-    body: RigidBody
-    assumptions: list[str]
-    mesh_folder: TemporaryDirectory[str] | None = None
 
 
 def ParseModel(
@@ -61,18 +50,19 @@ def ParseModel(
     models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
-    read = repair_and_parse_model(plant, path, package_paths, ModelPurpose(sensor_frame, hold))
-    frame = _find_sensor_frame(plant, read.instances, sensor_frame, where)
+    purpose = ModelPurpose(sensor_frame, hold)
+    added_instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
+    frame = _find_sensor_frame(plant, added_instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
     held = weld_held_joints(plant, hold, added)
     chain = weld_base_and_find_chain(plant, frame, X_WBase, where)
-    check_chain(plant, chain, read.repaired.dependence_reasons, where)
-    free = weld_free_bodies(plant, read.instances)
+    check_chain(plant, chain, repaired.dependence_reasons, where)
+    free = weld_free_bodies(plant, added_instances)
     with translate_drake_errors(path):
         held += weld_joints_outside_chain(plant, before, chain)
-        limits = read.repaired.effort_limits if read.repaired.text else None
+        limits = repaired.effort_limits if repaired.text else None
         set_one_actuator_per_joint(plant, chain, limits)
-        rotors = assume_rotor_inertias(plant, chain, frame, read.repaired.auxiliary_bodies)
+        rotors = assume_rotor_inertias(plant, chain, frame, repaired.auxiliary_bodies)
     instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
@@ -80,18 +70,20 @@ def ParseModel(
         remedy = "write the chain up to the sensor as one model"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     instance = next(iter(instances), frame.model_instance())
-    assumptions = [*read.repaired.assumptions, *free, *held, *rotors]
-    return ParsedModel(instance, frame, assumptions, read.mesh_folder)
+    return ParsedModel(instance, frame, [*repaired.assumptions, *free, *held, *rotors])
 
 
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
-) -> ParsedTool:
-    """Parse a tool, weld its root link to S by the joint "sensor_weld", and weld its own joints."""
-    before = set(plant.GetJointIndices())
-    read = repair_and_parse_model(plant, path, package_paths, ModelPurpose(is_tool=True))
+) -> tuple[RigidBody, list[str]]:
+    """Parse a tool, weld its root link to S by the joint "sensor_weld", and weld its own joints.
+
+    Return the root link, and the assumptions.
+    """
+    before, purpose = set(plant.GetJointIndices()), ModelPurpose(is_tool=True)
+    instances, repaired = repair_and_parse_model(plant, path, package_paths, purpose)
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
-    bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
+    bodies = [index for instance in instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
         names = ", ".join(body.name() for body in roots) or "none"
@@ -99,19 +91,18 @@ def ParseTool(
         remedy = "give one tree of links; its root is welded to the sensor frame"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     with translate_drake_errors(path):
-        assumptions = [*read.repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
+        assumptions = [*repaired.assumptions, *weld_joints_outside_chain(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
-    return ParsedTool(roots[0], assumptions, read.mesh_folder)
+    return roots[0], assumptions
 
 
-def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
-    """Parse the surroundings of an arm; return the folder of their converted meshes."""
-    read = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
-    for name, what in read.repaired.dependence_reasons.items():
+def ParseScene(plant: MultibodyPlant, path: Path) -> None:
+    """Parse the surroundings of an arm."""
+    _, repaired = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
+    for name, what in repaired.dependence_reasons.items():
         remedy = "correct it; every object that the tool could touch must be readable"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
-    return read.mesh_folder
 
 
 def _find_sensor_frame(
