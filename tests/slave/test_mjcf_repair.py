@@ -17,8 +17,7 @@ from test_model_repairs import pose, read, written
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.mjcf_masses import fit_shape_to_mesh
-from drake_teleop.station.slave.model.mjcf_meshes import Mesh
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh, fit_shape_to_mesh
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 from drake_teleop.station.slave.model.triangles import Triangles
