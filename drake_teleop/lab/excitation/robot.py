@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
-from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -23,13 +21,12 @@ from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import (
-    ArmModelFromPlant,
     check_arm_lengths,
     fill_missing_joint_limits,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, read_arm_kinematics
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
@@ -55,17 +52,13 @@ class Robot:
     """Arm with surroundings, limits and sensor noise.
 
     Attributes:
-        plant: Drake's plant, with the heaviest load.
-        sensor_frame: frame S of the wrist sensor.
+        scene: Drake's plant, with the heaviest load.
         home_posture: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
     """
 
     name: str
-    diagram: Diagram
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    sensor_frame: Frame
+    scene: CollisionScene
     arm: ArmModel
     limits: Limits
     criterion_scales: CriterionScales
@@ -127,11 +120,7 @@ def RobotFromModel(
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
-    with translate_drake_errors(path):
-        plant = MultibodyPlant(0.0)
-        instance, frame = parse(plant)
-        finalize_plant(plant)
-        arm = ArmModelFromPlant(plant, instance, frame.name())
+    arm = read_arm_kinematics(path, sensor_frame, package_paths)
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
@@ -220,10 +209,7 @@ def _make_robot(
     )
     return Robot(
         name=name,
-        diagram=scene.diagram,
-        plant=scene.plant,
-        scene_graph=scene.scene_graph,
-        sensor_frame=scene.sensor_frame,
+        scene=scene,
         arm=arm,
         limits=limits,
         criterion_scales=CriterionScales(
