@@ -527,7 +527,7 @@ def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
-    monkeypatch.setattr("drake_teleop.lab.excitation.robot.finalize_plant", refused)
+    monkeypatch.setattr("drake_teleop.station.slave.plant.finalize_plant", refused)
     with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 

@@ -27,7 +27,6 @@ from drake_teleop.common.vectors import (
     plus,
     quaternion_of_matrix,
     scale_vector,
-    solve_by_cholesky,
     symmetric_matrix_at,
     transposed,
     vector_at,
@@ -350,11 +349,31 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         # Momentum about Wo of all outboard links for unit speed of this joint.
         linear = add_cross_product(scale_vector(c[0], v), w, h)
         angular = add_cross_product(apply_matrix(symmetric_matrix_at(c, 4), w), h, v)
-        # `solve_by_cholesky` reads the lower half only.
+        # `solve_positive_definite` reads the lower half only.
         for i in range(row + 1):
             v, w = vector_at(link[i], 6), vector_at(link[i], 9)
             M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
         M[row, row] += table[row, ROTOR_COLUMN]
+
+
+@njit(cache=True)
+def solve_positive_definite(M: Array, x: Array) -> None:
+    """Replace x by M^-1 x (Cholesky); overwrite the lower half of M."""
+    n = x.shape[0]
+    for j in range(n):
+        for k in range(j):
+            for i in range(j, n):
+                M[i, j] -= M[i, k] * M[j, k]
+        pivot = np.sqrt(M[j, j])
+        for i in range(j, n):
+            M[i, j] /= pivot
+        for k in range(j):
+            x[j] -= M[j, k] * x[k]
+        x[j] /= M[j, j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= M[k, i] * x[k]
+        x[i] /= M[i, i]
 
 
 @njit(cache=True)
@@ -386,7 +405,7 @@ def forward_dynamics(
         if table[row, DRY_FRICTION_COLUMN] != 0.0:
             vdot_out[row] += dry_friction(table[row, DRY_FRICTION_COLUMN], v[row])
     _mass_matrix(table, link, inertia, M)
-    solve_by_cholesky(M, vdot_out, n)
+    solve_positive_definite(M, vdot_out)
 
 
 @njit(cache=True)

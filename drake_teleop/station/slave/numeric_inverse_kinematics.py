@@ -22,7 +22,6 @@ from drake_teleop.common.vectors import (
     quaternion_logarithm,
     quaternion_of_matrix,
     quaternion_product,
-    solve_by_cholesky,
     vector_at,
 )
 from drake_teleop.station.slave.arm import (
@@ -31,6 +30,7 @@ from drake_teleop.station.slave.arm import (
     TRANSLATION_COLUMN,
     ArmModel,
     jacobian_and_pose,
+    solve_positive_definite,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
@@ -111,7 +111,7 @@ def _find_smallest_eigenpair(H, u):
             for k in range(m):
                 M[i, k] = H[i, k]
             M[i, i] += _MIN_STEP_DAMPING_M2
-        solve_by_cholesky(M, u, m)
+        solve_positive_definite(M, u)
         growth = 0.0
         for i in range(m):
             growth += u[i] * u[i]
@@ -145,7 +145,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
                 if held[k] and not held[i]:
                     d[i] -= H[i, k] * fixed[k]
             M[i, i] = 1.0 if held[i] else H[i, i] + damping
-        solve_by_cholesky(M, d, n)
+        solve_positive_definite(M, d)
         outside = False
         for i in range(n):
             if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
