@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,12 @@ from drake_teleop.station.scenario import (
     ScenarioNames,
     replace,
 )
-from drake_teleop.station.scenario_reference import (
-    json_schema,
-    reference_page,
-    to_commented_yaml,
-    write_scenario,
-)
+from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 from drake_teleop.station.sensor.presets import PRESETS
 
 DOCS = Path(__file__).parents[1] / "docs"
+REFERENCE = runpy.run_path(str(DOCS / "make_reference.py"))
+reference_page, json_schema = REFERENCE["reference_page"], REFERENCE["scenario_schema"]
 
 
 def loaded(text: str) -> Scenario:

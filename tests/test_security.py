@@ -101,7 +101,7 @@ WRITING = {
     ("station/slave/model/meshes.py", ".write_text"),
     ("station/slave/model/mjcf_meshes.py", ".write_text"),
     ("station/slave/model/sdf_repair.py", ".write_text"),
-    ("station/slave/model_files.py", ".write_text"),
+    ("station/slave/models.py", ".write_text"),
     # One line for each change of a drive's inputs; it remains after a crash.
     ("live/record.py", 'open("x'),
     # Written to memory, then to the file after the earlier wrenches.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import reprlib
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -128,13 +129,17 @@ def nonnegative_array(name: str, value: ArrayLike, *shape: int) -> Array:
     return array
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread in a context; several threads change the last digits of sums."""
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread, in a context or, as decorator, in a function.
+
+    Several threads change the last digits of sums.
+    """
     import scipy.linalg  # noqa: F401 (a BLAS that is loaded later is not limited)
     from threadpoolctl import threadpool_limits
 
-    limits: AbstractContextManager[object] = threadpool_limits(1)
-    return limits
+    with threadpool_limits(1):
+        yield
 
 
 def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +28,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     estimate_from_poses,
     fit_motion_to_load,
 )
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import (
     choose_delay,
@@ -55,16 +57,11 @@ _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 def _estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
-    posed = log.posed
-    assert posed is not None
-
-    def estimate_at_delay(late: float | None) -> PoseEstimate:
-        arrays = log.t, log.wrench, posed.poses, posed.gravity_W
-        return estimate_from_poses(
-            *arrays, delay=late, gain_std=log.gain_std, lost=log.bridged, imu=posed.imu
-        )
-
-    return _fit_with_usual_delay_if_undetermined(log, delay, estimate_at_delay, 0.0, "undetermined")
+    assert log.posed is not None
+    estimate = partial(estimate_from_poses, gain_std=log.gain_std)
+    return _fit_with_usual_delay_if_undetermined(
+        log, log.posed, delay, estimate, 0.0, "undetermined"
+    )
 
 
 def fit_motion_to_known_load(
@@ -75,17 +72,12 @@ def fit_motion_to_known_load(
     `load` (6, 16) are the load's coefficients, Eq. (T73). The delay is `usual_s` [s] if the record
     does not determine it. Return None for a short log, and without poses or if the IMU disagrees.
     """
-    posed = log.posed
-    if posed is None or log.static:
+    if log.posed is None or log.static:
         return None
-    arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
-
-    def motion_at_delay(late: float | None) -> PoseMotion:
-        return fit_motion_to_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
-
+    fit = partial(fit_motion_to_load, load=load)
     with suppress(DrakeTeleopError):  # too short
         found, source = _fit_with_usual_delay_if_undetermined(
-            log, delay, motion_at_delay, usual_s, "load"
+            log, log.posed, delay, fit, usual_s, "load"
         )
         return (found, source) if found.is_imu_consistent_with_poses else None
     return None
@@ -93,15 +85,18 @@ def fit_motion_to_known_load(
 
 def _fit_with_usual_delay_if_undetermined(
     log: Log,
+    posed: PosesOfLog,
     delay: str | float,
-    motion: Callable[[float | None], _PoseMotionT],
+    fit: Callable[..., _PoseMotionT],
     usual_s: float,
     usual: str,
 ) -> tuple[_PoseMotionT, str]:
+    arrays = log.t, log.wrench, posed.poses, posed.gravity_W
+    fit = partial(fit, *arrays, lost=log.bridged, imu=posed.imu)
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
-    found = motion(known)
+    found = fit(delay=known)
     if known is None and not found.delay_std_s < _MAX_KNOWN_DELAY_STD_S:
-        return motion(usual_s), usual
+        return fit(delay=usual_s), usual
     return found, source
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -157,6 +156,7 @@ class EliminatedLog:
         return none if self.detection is None else self.detection.touched
 
 
+@one_blas_thread()
 def identify_log(
     path: str | Path,
     *,
@@ -179,28 +179,7 @@ def identify_log(
     """
     METHODS.check(method, "method")
     _check_log_arguments(path, cutoff_hz)
-    with one_blas_thread():
-        check = partial(check_file, Path(path)) if checks is None else lambda: checks
-        return _read_and_identify_log(path, method, cutoff_hz, delay, check)
-
-
-def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
-    expect_type((str, Path), path, "log", "give the file's name")
-    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
-        raise DrakeTeleopError(
-            f"{cutoff_hz:g} Hz is too low",
-            where="cutoff_hz",
-            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter",
-        )
-
-
-def _read_and_identify_log(
-    path: str | Path,
-    method: str,
-    cutoff_hz: float | None,
-    delay: str | float,
-    check: Callable[[], Conventions],
-) -> IdentifiedLog:
+    check = partial(check_file, Path(path)) if checks is None else lambda: checks
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     posed, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
@@ -257,6 +236,16 @@ def _read_and_identify_log(
         *(findings, causes, () if why is None else why.loads),
         delay_std_s=float("nan") if motion is None else motion.delay_std_s,
     )
+
+
+def _check_log_arguments(path: Any, cutoff_hz: Any) -> None:
+    expect_type((str, Path), path, "log", "give the file's name")
+    if cutoff_hz is not None and not to_float("cutoff_hz", cutoff_hz) >= MIN_BANDWIDTH_HZ:
+        raise DrakeTeleopError(
+            f"{cutoff_hz:g} Hz is too low",
+            where="cutoff_hz",
+            remedy=f"give at least {MIN_BANDWIDTH_HZ:g} Hz, or None for no filter",
+        )
 
 
 def _fit_load_to_motion(

@@ -297,7 +297,6 @@ class _ReplayDevice(NamedTuple):
     hand: Frame
     grip: Array
     to_plant_positions: Callable[[Array], Array]
-    model_folder: object = None
 
 
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
@@ -306,7 +305,7 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
         on_table = RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M])
         arm = leader.add_to_plant(plant, on_table)
         hand, grip = arm.sensor_frame, np.zeros(3)
-        return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order], arm.mesh_folder)
+        return _ReplayDevice(arm.instance, hand, grip, lambda q: q[order])
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))

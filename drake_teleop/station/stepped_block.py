@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import weakref
 from abc import abstractmethod
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
 
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import Array
@@ -18,8 +25,8 @@ class SteppedBlock(DoubleOnly, LeafSystem):
 
     __slots__ = ()
 
-    def _declare_step(self, results: list[Array], num_states: int, period: float) -> Any:
-        """Declare states and the period [s]; return the ticket of the step for output ports.
+    def _declare_step(self, results: list[Array], num_states: int, period: float) -> None:
+        """Declare states and the period [s].
 
         `results` are start values of the step's results; the first `num_states` are the states.
         """
@@ -32,8 +39,17 @@ class SteppedBlock(DoubleOnly, LeafSystem):
         sources = {self.all_input_ports_ticket(), self.xd_ticket()}
         step = self.DeclareCacheEntry("step", producer, sources)
         self._step = step.cache_index()  # the entry itself would keep the block alive
+        self._after_step = {step.ticket()}
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        return step.ticket()
+
+    def _declare_output(self, name: str, result: int, part: slice) -> None:
+        """Declare an output port with `part` of the step's result of index `result`."""
+        block: Any = weakref.ref(self)
+
+        def copy_part(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(block()._step_results(context)[result][part])
+
+        self.DeclareVectorOutputPort(name, part.stop - part.start, copy_part, self._after_step)
 
     @abstractmethod
     def _advance(self, context: Context, results: list[Array]) -> None:

@@ -147,8 +147,8 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
         show = make_scene(Canvas())
         for k in (0, 40):
             show(0.0, k)
-            X_WB = shown[f"/arm/{int(slave.sensor_frame.body().index())}"]
-            frames.append(X_WB @ slave.sensor_frame.GetFixedPoseInBodyFrame())
+            X_WB = shown[f"/arm/{int(slave.scene.sensor_frame.body().index())}"]
+            frames.append(X_WB @ slave.scene.sensor_frame.GetFixedPoseInBodyFrame())
             q = short.trajectory.evaluate(film.times[k : k + 1])[0][0]
             R, p = np.empty((3, 3)), np.empty(3)
             forward_kinematics(slave.arm.table, q, R, p)
@@ -307,14 +307,14 @@ def test_environment_of_the_scenario_is_avoided(name):
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
     assert all(use.used_share <= 1 for use in found.limit_uses)
-    context = robot.diagram.CreateDefaultContext()
-    of_plant = robot.plant.GetMyMutableContextFromRoot(context)
-    of_scene = robot.scene_graph.GetMyContextFromRoot(context)
-    port = robot.scene_graph.get_query_output_port()
-    q = robot.plant.GetPositions(of_plant)
+    context = robot.scene.diagram.CreateDefaultContext()
+    of_plant = robot.scene.plant.GetMyMutableContextFromRoot(context)
+    of_scene = robot.scene.scene_graph.GetMyContextFromRoot(context)
+    port = robot.scene.scene_graph.get_query_output_port()
+    q = robot.scene.plant.GetPositions(of_plant)
     for t in np.linspace(0, 2.4, 100):
         q[robot.arm.position_index] = found.trajectory.evaluate(t)[0]
-        robot.plant.SetPositions(of_plant, q)
+        robot.scene.plant.SetPositions(of_plant, q)
         assert not port.Eval(of_scene).HasCollisions()
 
 
@@ -544,7 +544,7 @@ def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
-    monkeypatch.setattr("drake_teleop.lab.excitation.robot.finalize_plant", refused)
+    monkeypatch.setattr("drake_teleop.station.slave.plant.finalize_plant", refused)
     with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 

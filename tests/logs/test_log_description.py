@@ -2,16 +2,18 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
 import yaml
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.read.description import Description, json_schema, load_description
+from drake_teleop.logs.read.description import Description, load_description
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = DOCS / "log-description.md"
+json_schema = runpy.run_path(str(DOCS / "make_reference.py"))["log_description_schema"]
 SCHEMA = DOCS / "log-description.schema.json"
 EXAMPLES = [
     example

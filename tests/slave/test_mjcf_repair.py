@@ -17,8 +17,7 @@ from test_model_repairs import pose, read, written
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
-from drake_teleop.station.slave.model.mjcf_masses import fit_shape_to_mesh
-from drake_teleop.station.slave.model.mjcf_meshes import Mesh
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh, fit_shape_to_mesh
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 from drake_teleop.station.slave.model.triangles import Triangles
@@ -472,11 +471,10 @@ DOOR = '<body name="door"><joint name="hinge"{}/><geom type="box" size="1 1 1"/>
 def test_scene_keeps_its_bodies_and_refuses_what_drake_ignores(tmp_path):
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     floor = '<geom type="plane" size="1 1 1"/>'
-    folder = ParseScene(plant, written(tmp_path, mjcf(floor + CUP + DOOR.format("")), "a.xml"))
+    ParseScene(plant, written(tmp_path, mjcf(floor + CUP + DOOR.format("")), "a.xml"))
     plant.Finalize()
     assert plant.num_velocities() == 7
     assert len(plant.GetCollisionGeometriesForBody(plant.world_body())) == 1
-    folder.cleanup()
     for door, tail, expected in (
         (DOOR.format(' stiffness="3"'), "", "no spring, .* of hinge"),
         (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "no coupling, .* by weld"),
@@ -491,10 +489,10 @@ def test_tool_has_one_free_root_and_held_joints(tmp_path, root):
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     loop = '<equality><connect body1="f" body2="g" anchor="0 0 0"/></equality>'
     text = mjcf(f'<body name="hand" pos="1 2 3">{root}{INERTIAL}{FINGERS}</body>', tail=loop)
-    tool = ParseTool(plant, written(tmp_path, text, "a.xml"), plant.world_frame())
+    body, assumptions = ParseTool(plant, written(tmp_path, text, "a.xml"), plant.world_frame())
     plant.Finalize()
-    assert tool.body.name() == "hand"
-    assert "held: f, g" in tool.assumptions
+    assert body.name() == "hand"
+    assert "held: f, g" in assumptions
     assert plant.num_velocities() == 0
-    X_WT = tool.body.EvalPoseInWorld(plant.CreateDefaultContext())
+    X_WT = body.EvalPoseInWorld(plant.CreateDefaultContext())
     assert X_WT.IsExactlyIdentity()

@@ -19,11 +19,11 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.model.link_repair import (
+from drake_teleop.station.slave.model.model_numbers import (
+    check_lengths_and_inertias,
     nearest_possible_inertia,
     repair_inertia,
 )
-from drake_teleop.station.slave.model.model_numbers import check_lengths_and_inertias
 from drake_teleop.station.slave.model.repair_report import RepairReport
 from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
 from drake_teleop.station.slave.models import ParseModel, ParseScene

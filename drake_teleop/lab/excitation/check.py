@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.geometry import QueryObject
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialInertia
+from pydrake.multibody.tree import MultibodyForces, SpatialInertia
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.lab.excitation.collision import CollisionScene
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.station.slave.plant import bodies_carried_by
 
 #: Sample rate of the check [Hz].
 CHECK_RATE_HZ = 1000.0
@@ -99,15 +100,16 @@ def _evaluate_limited_quantities(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
 ) -> tuple[Array, Array, Array, Array, list[str]]:
     # Joint torques, sensor norms, uses of workspace and clearance, nearest shapes.
-    plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
-    root = robot.diagram.CreateDefaultContext()
+    scene, limits, arm = robot.scene, robot.limits, robot.arm
+    plant, frame_S, root = scene.plant, scene.sensor_frame, scene.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
-    scene_context = robot.scene_graph.GetMyContextFromRoot(root)
+    scene_context = scene.scene_graph.GetMyContextFromRoot(root)
     gravity = plant.gravity_field().gravity_vector()
     position, velocity = plant.GetPositions(context), np.zeros(plant.num_velocities())
     acceleration = velocity.copy()
-    M_S = plant.CalcSpatialInertia(context, frame_S, _bodies_outboard_of_sensor(plant, frame_S))
     body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
+    outboard = [each.index() for each in bodies_carried_by(plant, body)]
+    M_S = plant.CalcSpatialInertia(context, frame_S, outboard)
     torque, kinematics = np.empty(q.shape), np.empty((len(q), 3, 3))
     workspace = np.empty((len(q), limits.points_S.size))
     clearance, nearest = np.empty(len(q)), []
@@ -128,9 +130,9 @@ def _evaluate_limited_quantities(
         kinematics[k] = kinematics[k] @ X_WS.rotation().matrix()
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
-        query = robot.scene_graph.get_query_output_port().Eval(scene_context)
+        query = scene.scene_graph.get_query_output_port().Eval(scene_context)
         distance, words = _nearest_shape_pair(
-            robot, query, limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
+            scene, query, limits.clearance + _SHAPE_PAIR_SEARCH_MARGIN_M
         )
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
@@ -149,20 +151,14 @@ def _norms_at_sensor(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) 
     return np.linalg.norm([force, torque, s, alpha], axis=2).T
 
 
-def _bodies_outboard_of_sensor(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    found = [frame_S.body().index()]
-    for body in found:
-        found += [j.child_body().index() for j in joints if j.parent_body().index() == body]
-    return found[1:]
-
-
-def _nearest_shape_pair(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
+def _nearest_shape_pair(
+    scene: CollisionScene, query: QueryObject, reach: float
+) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"
     pair = min(found, key=lambda pair: pair.distance)
-    inspector = robot.scene_graph.model_inspector()
+    inspector = scene.scene_graph.model_inspector()
     frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
-    names = (robot.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+    names = (scene.plant.GetBodyFromFrameId(frame).name() for frame in frames)
     return float(pair.distance), " and ".join(names)

@@ -222,19 +222,24 @@ class CollisionScene:
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
         write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
-        for shape in sorted(
-            {shape for pair in candidates for shape in pair}, key=_number_of_shape_id
-        ):
+        shapes = {shape for pair in candidates for shape in pair}
+        for shape in sorted(shapes, key=GeometryId.get_value):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
-            X_LB = X_WB if row < 0 else _pose_of_link_motion(motions[0, row]).InvertAndCompose(X_WB)
+            X_WL = RigidTransform()
+            if row >= 0:
+                *_, p_WL, R_WL = np.split(motions[0, row], [9, 12])
+                X_WL = RigidTransform(RotationMatrix(R_WL.reshape(3, 3)), p_WL)
             capsule = bounding_capsule(inspector.GetShape(shape))
-            capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
+            capsules[shape] = (
+                row,
+                capsule.transformed(X_WL.InvertAndCompose(X_WB) @ inspector.GetPoseInFrame(shape)),
+            )
             if inspector.GetName(shape).endswith(_TABLE_NAME):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _shape_with_enclosing_capsule(shape, capsules) for shape in capsules}
-        outer_shapes = sorted({outer[shape] for shape in outer}, key=_number_of_shape_id)
+        outer_shapes = sorted({outer[shape] for shape in outer}, key=GeometryId.get_value)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
@@ -243,11 +248,11 @@ class CollisionScene:
             )
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
-        shapes = [capsules[shape][1] for shape in outer_shapes]
+        outer_capsules = [capsules[shape][1] for shape in outer_shapes]
         motions = empty_motions(len(postures), self.arm.num_joints)
         write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
-        ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
-        radii = np.array([capsule.radius for capsule in shapes])
+        ends = np.array([capsule.ends for capsule in outer_capsules]).reshape(-1, 2, 3)
+        radii = np.array([capsule.radius for capsule in outer_capsules])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
@@ -294,24 +299,16 @@ def _exclude_coaxial_pairs(
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
 
 
-def _number_of_shape_id(shape: GeometryId) -> int:
-    return int(shape.get_value())
-
-
 def _shape_with_enclosing_capsule(
     shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
 ) -> GeometryId:
     row, capsule = capsules[shape]
     holding = [
-        (other.radius, -_number_of_shape_id(name), name)
+        (other.radius, -name.get_value(), name)
         for name, (other_row, other) in capsules.items()
         if other_row == row and other.contains(capsule)
     ]
     return max(holding, key=lambda entry: entry[:2])[2]
-
-
-def _pose_of_link_motion(motion: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 
 def _add_load(

@@ -93,9 +93,8 @@ def write_sensor_motion(motions, out):
 def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
     """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
     rows = motions.shape[1]
-    seeds = np.zeros((rows, SEED_SIZE))
-    c, virtual = np.zeros(rows - 1), np.zeros((rows, 6))
-    g = np.empty((3, 3))
+    seeds, g = np.zeros((rows, SEED_SIZE)), np.empty((3, 3))
+    work = seeds, np.zeros(rows - 1), np.zeros((rows, 6))
     for t in range(len(motions)):
         motion = motions[t, -1]
         omega = rotate_to_link(motion, (motion[3], motion[4], motion[5]))
@@ -103,10 +102,7 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
         seeds[-1] = 0.0
         for k in range(3):
             add_vector_to_seed(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
-        pull_back_seeds(
-            table, motions[t], qd[t], qdd[t], c, virtual, seeds,
-            gradient[0, t], gradient[1, t], gradient[2, t],
-        )  # fmt: skip
+        _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)

@@ -38,8 +38,8 @@ def write_motion_replay(path: Path, found: Excitation) -> None:
     robot, trajectory = found.robot, found.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
-    root = robot.diagram.CreateDefaultContext()
-    context = robot.plant.GetMyMutableContextFromRoot(root)
+    root = robot.scene.diagram.CreateDefaultContext()
+    context = robot.scene.plant.GetMyMutableContextFromRoot(root)
     poses = [_link_poses(robot, context, posture) for posture in q]
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
@@ -79,17 +79,17 @@ def write_motion_replay(path: Path, found: Excitation) -> None:
 def _link_poses(
     robot: Robot, context: Context, posture: Array
 ) -> tuple[dict[BodyIndex, RigidTransform], RigidTransform]:
-    plant = robot.plant
+    plant = robot.scene.plant
     q = plant.GetPositions(context)
     q[robot.arm.position_index] = posture
     plant.SetPositions(context, q)
     bodies = (plant.get_body(BodyIndex(k)) for k in range(1, plant.num_bodies()))
     poses = {body.index(): plant.EvalBodyPoseInWorld(context, body) for body in bodies}
-    return poses, robot.sensor_frame.CalcPoseInWorld(context)
+    return poses, robot.scene.sensor_frame.CalcPoseInWorld(context)
 
 
 def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    plant, inspector = robot.plant, robot.scene_graph.model_inspector()
+    plant, inspector = robot.scene.plant, robot.scene.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))
         visuals = plant.GetVisualGeometriesForBody(body)
@@ -105,11 +105,11 @@ def _AddLinkVisuals(meshcat: Meshcat, robot: Robot, context: Context) -> None:
 
 
 def _outboard_joint_points(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
-    plant = robot.plant
+    plant = robot.scene.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
-    if robot.sensor_frame.body() is body:
-        frames.append(robot.sensor_frame)
+    if robot.scene.sensor_frame.body() is body:
+        frames.append(robot.scene.sensor_frame)
     for frame in frames:
         p_BJ = frame.CalcPose(context, body.body_frame()).translation()
         if np.linalg.norm(p_BJ) > 1e-3:

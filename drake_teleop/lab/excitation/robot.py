@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
-from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -25,13 +21,12 @@ from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import (
-    ArmModelFromPlant,
     check_arm_lengths,
     fill_missing_joint_limits,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, read_arm_kinematics
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
@@ -57,24 +52,19 @@ class Robot:
     """Arm with surroundings, limits and sensor noise.
 
     Attributes:
-        plant: Drake's plant, with the heaviest load.
-        sensor_frame: frame S of the wrist sensor.
+        scene: Drake's plant, with the heaviest load.
         home_posture: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
     """
 
     name: str
-    diagram: Diagram
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    sensor_frame: Frame
+    scene: CollisionScene
     arm: ArmModel
     limits: Limits
     criterion_scales: CriterionScales
     sensor_noise: SensorNoise
     home_posture: Array
     assumptions: tuple[str, ...]
-    temporary_folders: tuple[TemporaryDirectory[str], ...] = ()
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
@@ -85,10 +75,9 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         parsed = ParseSlave(plant, scenario.slave)
         if scenario.surroundings is not None:
             AddEnvironment(plant, scenario.surroundings)
-        folders.extend(parsed.mesh_folders)
         return parsed.instance, parsed.sensor_frame
 
-    slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
+    slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
     scene = CollisionScene(
         parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_count=not own
@@ -105,7 +94,6 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         points_S=np.array([np.zeros(3), slave.tip] if own else _TOOL_POINTS_IN_WORKSPACE_S),
         box=_UNLIMITED_BOX if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
-        folders=folders,
     )
 
 
@@ -125,20 +113,14 @@ def RobotFromModel(
     Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
     """
     missing: list[str] = []
-    folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         missing[:] = model.assumptions
-        folders.append(model.mesh_folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
-    with translate_drake_errors(path):
-        plant = MultibodyPlant(0.0)
-        instance, frame = parse(plant)
-        finalize_plant(plant)
-        arm = ArmModelFromPlant(plant, instance, frame.name())
+    arm = read_arm_kinematics(path, sensor_frame, package_paths)
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
@@ -178,7 +160,6 @@ def RobotFromModel(
         points_S=np.zeros((1, 3)),
         box=_UNLIMITED_BOX,
         assumptions=assumptions + completed,
-        folders=folders,
     )
 
 
@@ -193,7 +174,6 @@ def _make_robot(
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
-    folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
@@ -229,10 +209,7 @@ def _make_robot(
     )
     return Robot(
         name=name,
-        diagram=scene.diagram,
-        plant=scene.plant,
-        scene_graph=scene.scene_graph,
-        sensor_frame=scene.sensor_frame,
+        scene=scene,
         arm=arm,
         limits=limits,
         criterion_scales=CriterionScales(
@@ -241,5 +218,4 @@ def _make_robot(
         sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home_posture=middle if start is None else start,
         assumptions=tuple(assumptions),
-        temporary_folders=tuple(folders),
     )

@@ -8,7 +8,6 @@ A number x of a file becomes a quantity in S by
 from __future__ import annotations
 
 import difflib
-import json
 import os
 import types
 import typing
@@ -342,19 +341,6 @@ class Description(StrictModel):
     def unit_in_si(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
-
-
-def json_schema() -> str:
-    schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    schema |= Description.model_json_schema()
-    # With a topic, only the file is required.
-    for name in ("Wrench", "Imu", "Pose"):
-        stream = schema["$defs"][name]
-        without = [field for field in stream["required"] if field != "file"]
-        stream |= {"required": ["file"], "anyOf": [{"required": ["topic"]}, {"required": without}]}
-    for name in ("Force", "Torque", "Acceleration", "AngularVelocity", "Position"):
-        del schema["$defs"][name]["required"]
-    return json.dumps(schema, indent=2) + "\n"
 
 
 def load_description(path: str | Path) -> Description:

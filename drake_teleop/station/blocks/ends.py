@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
+from pydrake.systems.framework import Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.channel.channel import (
     MIN_TIMEOUT_S,
@@ -61,10 +60,9 @@ class _PassivityEndBlock(SteppedBlock):
         results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUT_PORTS]
-        step = self._declare_step(results, 3, period)
-        calculate = weak_callback(self._calc_packet)
-        self.DeclareVectorOutputPort("packet", PACKET_SIZE, calculate, {step})
-        self._declare_outputs(step)
+        self._declare_step(results, 3, period)
+        self._declare_output("packet", 4, slice(0, PACKET_SIZE))
+        self._declare_outputs()
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         packet = self._received.Eval(context)
@@ -74,9 +72,6 @@ class _PassivityEndBlock(SteppedBlock):
         ]
         received, is_fresh = np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
         self._step_method(inputs, received, is_fresh, *results)
-
-    def _calc_packet(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[-1])
 
 
 class PassivityAtMaster(_PassivityEndBlock):
@@ -99,9 +94,8 @@ class PassivityAtMaster(_PassivityEndBlock):
     __slots__ = ()
     _INPUT_PORTS = (("pose_command", 7), ("hand_wrench_E", 6))
 
-    def _declare_outputs(self, step: Any) -> None:
-        calculate = weak_callback(self._calc_wrench)
-        self.DeclareVectorOutputPort("wrench_to_master", 6, calculate, {step})
+    def _declare_outputs(self) -> None:
+        self._declare_output("wrench_to_master", 3, slice(0, 6))
 
     def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
@@ -110,9 +104,6 @@ class PassivityAtMaster(_PassivityEndBlock):
         work = ports[:2]
         constants = *self._constants, ends, work, packet, wrench
         step_master_end(self._method, *inputs, received, fresh, *constants)
-
-    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[3][:6])
 
 
 class PassivityAtSlave(_PassivityEndBlock):
@@ -141,7 +132,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         *(("saturated", 1), ("contact", 1)),
     )
 
-    def _declare_outputs(self, step: Any) -> None:
+    def _declare_outputs(self) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
     def _step_method(

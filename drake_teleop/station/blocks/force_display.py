@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
-from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.master.dynamics import HapticDeviceBase
 from drake_teleop.station.master.force_display import (
@@ -47,25 +46,14 @@ class ForceDisplay(SteppedBlock):
         memory = initial_display_state(finite_array("start", start, 6), device.parameters)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._position = self.DeclareVectorInputPort("joint_position", 6)
-        step = self._declare_step([memory], 1, period)
-        for name, size, calc in (
-            ("joint_torque", 6, self._calc_torque),
-            ("force_to_master", 6, self._calc_force),
-            ("fault_at_hand", 1, self._calc_fault),
-        ):
-            self.DeclareVectorOutputPort(name, size, weak_callback(calc), {step})
+        self._declare_step([memory], 1, period)
+        self._declare_output("joint_torque", 0, slice(0, 6))
+        self._declare_output("force_to_master", 0, DISPLAYED_WRENCH_SLOTS)
+        fault = DISPLAYED_WRENCH_SLOTS.stop
+        self._declare_output("fault_at_hand", 0, slice(fault, fault + 1))
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         (drive,), command = results, self._command.Eval(context)
         device = drive.copy()
         device[:6] = self._position.Eval(context)
         step_display(command, device, self._parameters, self._period, self._jacobian, drive)
-
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[0][:6])
-
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[0][DISPLAYED_WRENCH_SLOTS])
-
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_results(context)[0][DISPLAYED_WRENCH_SLOTS.stop]

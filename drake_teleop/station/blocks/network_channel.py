@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
+from pydrake.systems.framework import Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel import network
@@ -63,10 +62,9 @@ class NetworkChannel(SteppedBlock):
         parts = network.initial_network_state(self._parameters, np.zeros(size))
         state = [*parts, np.zeros(1), np.zeros(size + 1)]
         self._packet = self.DeclareVectorInputPort("packet", size)
-        step = self._declare_step(state, len(state), period)
+        self._declare_step(state, len(state), period)
         self.DeclareStateOutputPort("received", DiscreteStateIndex(self._states[-1]))
-        calculate = weak_callback(self._calc_arriving)
-        self.DeclareVectorOutputPort("arriving", size + 1, calculate, {step})
+        self._declare_output("arriving", 3, slice(0, size + 1))
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         receiver, in_transit, count, received = results
@@ -74,6 +72,3 @@ class NetworkChannel(SteppedBlock):
         network.send_packet(self._parameters, line, k, self._packet.Eval(context))
         _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
         count[0], received[-1] = k + 1, fresh
-
-    def _calc_arriving(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[-1])

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex
+from pydrake.systems.framework import Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import all_in_range, weak_callback
+from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -355,7 +355,7 @@ class TeleopChannel(SteppedBlock):
         )
         results = [*receivers, ends, np.array(start), np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7)]
         self._initial_arguments = (passivity.method, parameters)
-        step = {self._declare_step(results, len(results) - 1, period)}
+        self._declare_step(results, len(results) - 1, period)
         # Packets in transit are abstract parameters, which a context clones. Drake would copy a
         # discrete state several times a step: 1.5 MB for `lunar`.
         self._in_transit = [
@@ -363,9 +363,9 @@ class TeleopChannel(SteppedBlock):
         ]
         for name, state in (("pose_received", 3), ("ports", 4)):
             self.DeclareStateOutputPort(name, DiscreteStateIndex(self._states[state]))
-        wrench, contact = weak_callback(self._calc_wrench), weak_callback(self._calc_contact_flag)
-        self.DeclareVectorOutputPort("wrench_received", 6, wrench, step)
-        self.DeclareVectorOutputPort("contact_at_hand", 1, contact, step)
+        self._declare_output("wrench_received", 5, _RECEIVED_WRENCH)
+        flag = slice(_RECEIVED_CONTACT_FLAG, _RECEIVED_CONTACT_FLAG + 1)
+        self._declare_output("contact_at_hand", 5, flag)
 
     def Restart(self, context: Context, command: Array, slave: Array, fills: float) -> None:
         """Restart the channel in a running station, without packets, at a constant slave command.
@@ -392,9 +392,3 @@ class TeleopChannel(SteppedBlock):
         contact = self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0
         states = *self._constants, forward, backward, *results[2:]
         step_channel(self._steps, *inputs, saturated, contact, *states)
-
-    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_results(context)[-1][_RECEIVED_WRENCH])
-
-    def _calc_contact_flag(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_results(context)[-1][_RECEIVED_CONTACT_FLAG]

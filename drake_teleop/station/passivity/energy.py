@@ -59,14 +59,6 @@ def _cumulative_work_into(wrench, pose, share, work):
             work[k, g] = work[k - 1, g] + dot_of_group(f, dx, g)
 
 
-def created_energy(energy: Array) -> Array:
-    """Return the energy created up to each sample: the running maximum of max(0, -energy) [J].
-
-    `energy` (N, ...) is the net energy that flowed into an element without initial energy [J].
-    """
-    return np.maximum.accumulate(np.maximum(-np.asarray(energy), 0.0), axis=0)
-
-
 @dataclass(frozen=True)
 class EnergyBalance:
     """Energy balance at one channel end, each (..., 2) for translation and rotation [J].
@@ -99,8 +91,3 @@ def energy_balance(memory: Array) -> EnergyBalance:
         for places in (STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY)
     )
     return EnergyBalance(stored, received, sent, lost)
-
-
-def energy_in_flight(master: EnergyBalance, slave: EnergyBalance) -> Array:
-    """Return the energy (..., 2) that was sent and has not arrived, sum of both directions [J]."""
-    return (master.sent - slave.received) + (slave.sent - master.received)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -212,7 +211,6 @@ class ParsedSlave:
     sensor_frame: Frame
     tool: BodyIndex
     assumptions: tuple[str, ...]
-    mesh_folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
         """Return the arm, after the plant is finalized, and the assumptions about its limits."""
@@ -242,21 +240,18 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     plant.RenameModelInstance(model.instance, ARM_INSTANCE_NAME)
     set_torque_limits(plant, model.instance, slave.torque_limits)
     frame, model_bodies = model.sensor_frame, bodies_carried_by(plant, model.sensor_frame.body())
-    assumptions, folders = [*model.assumptions], [model.mesh_folder]
+    assumptions = [*model.assumptions]
     if slave.tool is not None:
-        tool = AddTool(plant, slave.tool, frame, slave.package_folders)
-        assumptions += tool.assumptions
-        folders += [tool.mesh_folder] if tool.mesh_folder is not None else []
+        on_sensor, assumed = AddTool(plant, slave.tool, frame, slave.package_folders)
+        assumptions += assumed
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
             assumptions.append(f"{names} of the model on the sensor beside the tool")
-        on_sensor, holder = tool.body, tool.body.body_frame()
+        holder = on_sensor.body_frame()
     else:
         on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
     AddPayload(plant, holder, slave.payload)
-    return ParsedSlave(
-        slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions), folders
-    )
+    return ParsedSlave(slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions))
 
 
 def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:

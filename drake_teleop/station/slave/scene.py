@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
@@ -22,8 +21,6 @@ from drake_teleop.station.environment.environment import AddFreeJoint, Environme
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
-#: Folders of converted meshes, kept while the process runs.
-_CONVERTED_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
 _RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
 _TOOL_BALL_MESH_EDGE_M = 0.005  # m, edge length of the mesh of the tool's ball
 
@@ -58,9 +55,7 @@ class Scene(Environment):
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         before, path = plant.num_bodies(), self.path
-        folder = ParseScene(plant, path)
-        if any(Path(folder.name).iterdir()):
-            _CONVERTED_MESH_FOLDERS.append(folder)
+        ParseScene(plant, path)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_BODY_NAMES:

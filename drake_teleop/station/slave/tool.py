@@ -13,7 +13,7 @@ from drake_teleop.common.config import plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import ContactMaterial
-from drake_teleop.station.slave.models import ParsedTool, ParseTool
+from drake_teleop.station.slave.models import ParseTool
 
 _STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
@@ -104,9 +104,9 @@ def end_of_tool_shapes(tool: Tool) -> list[float] | None:
 
 
 def AddTool(
-    plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
-) -> ParsedTool:
-    """Add the tool to a plant and weld it to the sensor frame by the joint "sensor_weld"."""
+    plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...]
+) -> tuple[RigidBody, list[str]]:
+    """Weld the tool to the sensor frame by the joint "sensor_weld"; return body and assumptions."""
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
     body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _tool_spatial_inertia(tool))
@@ -114,7 +114,7 @@ def AddTool(
     plant.AddJoint(weld)
     if plant.geometry_source_is_registered():
         _add_tool_shapes(plant, body, tool)
-    return ParsedTool(body, [])
+    return body, []
 
 
 def _add_tool_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:

@@ -10,23 +10,26 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
     MIN_DIRECTION_VECTOR_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
 )
-from drake_teleop.station.slave.model.mjcf_masses import (
+from drake_teleop.station.slave.model.mjcf_meshes import (
     ZERO_MASS_PROPERTIES,
     MassProperties,
+    Mesh,
+    MeshLibrary,
     combine_mass_properties,
     fit_shape_to_mesh,
     mass_properties_of_mesh,
     mass_properties_of_primitive,
 )
-from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
-from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI
+from drake_teleop.station.slave.model.model_numbers import (
+    MAX_MODEL_VALUE_SI,
+    nearest_possible_inertia,
+)
 
 # Elements that generate bodies or joints.
 _BODY_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")

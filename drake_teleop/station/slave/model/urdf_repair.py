@@ -11,11 +11,11 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from drake_teleop.station.slave.model.link_repair import repair_inertia
 from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     parse_number,
+    repair_inertia,
     repair_joint,
     replace_commas_by_blanks,
 )
