@@ -9,10 +9,12 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.new_station.place import (
     _find_holdable_postures,
     _order_postures_to_solve,
     find_start_place,
+    last_joint_axis,
 )
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
@@ -28,7 +30,12 @@ from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.slave.arm import holding_torque, pose_into
+from drake_teleop.station.slave.arm import (
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
+    holding_torque,
+    pose_into,
+)
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.posture_shapes import (
     PostureShapes,
@@ -106,6 +113,28 @@ def plain(tmp_path_factory):
 
 def elbow_of(plan):
     return elbow_up_share(postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+
+
+def test_offset_of_a_nearly_straight_arm_has_no_direction():
+    origins = np.zeros((3, 3, 3))
+    origins[:, 2] = [0.0, 0.0, 1.0]
+    origins[:, 1] = [[0.02, 0.0, 0.5], [0.3, 0.0, 0.5], [0.0, -0.3, 0.5]]
+    origins[2, 2] = [0.8, 0.0, 0.6]
+    postures = Postures(*[np.zeros((3, 3))], origins, origins, np.zeros((3, 3, 3)), origins[:, 2])
+    line = np.array([0.8, 0.0, 0.6])
+    offset = origins[2, 1] - (origins[2, 1] @ line) * line
+    expected = [1.0, 0.0, offset[2] / np.linalg.norm(offset)]
+    np.testing.assert_allclose(elbow_up_share(postures, 1.0), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("height", "axis"), [(0.1, "y"), (0.0, "y"), (-0.1, "-y")])
+def test_axis_of_the_last_joint_points_away_from_it(height, axis):
+    arm = slave_arm(LoadScenario("touch"))
+    table = arm.table.copy()
+    row = table[arm.num_joints]
+    row[ROTATION_COLUMN:TRANSLATION_COLUMN] = [0, 0, 1, 1, 0, 0, 0, 1, 0]
+    row[TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3] = [0.2, -0.3, height]
+    assert last_joint_axis(replace(arm, table=table)) == axis
 
 
 def slave_of(plan, path):

@@ -13,10 +13,12 @@ from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import (
     LOAD_FADE_TIME_S,
+    MEMORY_SIZE,
     STATE_DISTURBED,
     STATE_LEARNING,
     STATE_OTHER_LOAD,
     STATE_SETTLED,
+    _force_has_changed,
     initial_monitor_memory,
     load_state_index,
     monitor_load,
@@ -101,6 +103,16 @@ def prior(grasped):
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
     estimator.update_samples(*rows)
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
+
+
+def test_force_changes_count_after_the_low_pass_has_settled():
+    memory, period, found = np.zeros(MEMORY_SIZE), 1e-3, []
+    for age in range(600):
+        force = 2.0 if age < 5 else 1.0 if age >= 300 else 0.0
+        residual = np.array([0.0, force, 0.0, 0.0, 0.0, 0.0])
+        found.append(_force_has_changed(memory, residual, float(age), period))
+    changed = 300 + round(1e3 * 0.05 * np.log(2.0))  # the low-pass reaches 0.5 N
+    assert not any(found[: changed + 90]) and all(found[changed + 110 :])
 
 
 def time_of(result, state, after=0.0):

@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.imu_checks import check_imu_signals
 from drake_teleop.logs.processing import check_log, identify_log
-from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS
+from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS, Log
+from drake_teleop.logs.read.description import Description
 
 Columns = dict[str, np.ndarray]
 IMU, POSE, BOTH = ("imu",), ("pose",), ("imu", "pose")
@@ -110,6 +112,32 @@ def _repeated_column(c: Columns) -> None:
 
 ABOUT_Z = Rotation.from_euler("z", 45, degrees=True).as_matrix()
 TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("omega", "alpha", "unit", "line"),
+    [
+        (1.0, 57.3, "rad/s^2", "set imu.angular_acceleration.unit: deg/s^2"),
+        (1.0, 1 / 57.3, "deg/s^2", "set imu.angular_acceleration.unit: rad/s^2"),
+        (57.3, 1.0, "rad/s^2", "set imu.angular_velocity.unit: deg/s"),
+    ],
+)
+def test_unit_of_the_wrong_rate_is_named(omega: float, alpha: float, unit: str, line: str) -> None:
+    t = np.arange(0.0, 4.0, 0.01)
+    at = motion_at(t)
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, omega * at.omega, alpha * at.alpha)
+    document: dict[str, Any] = {
+        stream: {"file": "log.csv", "time": {"column": "t"}}
+        | {name: {"columns": [f"{name}_{axis}" for axis in "xyz"]} for name in FIELDS[stream]}
+        for stream in ("wrench", "imu")
+    }
+    document["imu"]["angular_acceleration"]["unit"] = unit
+    description = Description.model_validate(document)
+    (finding,), corrected = check_imu_signals(description, log)
+    assert finding.name == "degrees" and finding.message.endswith(line)
+    assert corrected != description
+
+
 MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]] = [
     ("N mm", _times("torque", 1e3), IMU, "torque factor", "wrench.torque.unit: N mm"),
     ("lbf in", _times("torque", 8.851), POSE, "torque factor", "wrench.torque.unit: lbf in"),

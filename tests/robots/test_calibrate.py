@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, truth
 
+from drake_teleop.cli.calibrate import calibrate_command
 from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -260,6 +261,16 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
         recorder.add(Reading(k, 90.0 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.clock_changes <= 2
+
+
+def test_a_single_result_within_the_tolerance_is_not_known(tmp_path, monkeypatch) -> None:
+    path, out = tmp_path / "log.parquet", tmp_path / "out"
+    evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", path)
+    monkeypatch.setattr("drake_teleop.cli.calibrate.identify_command", lambda *_, **__: {})
+    monkeypatch.setattr("drake_teleop.robots.calibration.FIRST_RECORD_S", 9.0)
+    summary = calibrate_command(f"replay:{path}", out, until="mass 50 %", quiet=True)
+    assert summary["half_widths_95"]["mass"] < 0.1 and summary["looks"] == 1
+    assert summary["known"] == {"mass": False} and not summary["all_known"]
 
 
 @pytest.mark.long

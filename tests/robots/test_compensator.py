@@ -187,6 +187,15 @@ def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
 
 
+def test_no_delayed_wrench_is_older_than_a_silence() -> None:
+    compensator = Compensator(load(), DT, wait=3, cutoff_hz=None)
+    for reading in readings(20, touched=5.0):
+        compensator.step(reading, reading.t)
+    for reading in readings(1005, touched=-4.0)[1000:]:
+        out = compensator.step(reading, reading.t)
+        np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
+
+
 def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     compensator, delay = Compensator(load(), DT), 0.2
     flags = []
@@ -262,7 +271,7 @@ def test_delayed_wrenches_are_clipped() -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [("free", "done"), ("short", "fewer than 0.5 s"), ("moving", "the sensor moves"),
-     ("push", "contact, or"),
+     ("push", "contact, or"), ("twist", "contact, or"), ("spin", "the sensor moves"),
      ("wavers", "the wrench varies")],
 )  # fmt: skip
 def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
@@ -276,6 +285,7 @@ def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
     for reading in stream:
         values = reading.values.copy()
         values[2] += {"push": 8.0, "wavers": 0.5 * math.sin(30 * reading.t)}.get(name, 0.0)
+        values[[4, 11]] += {"twist": (0.4, 0.0), "spin": (0.0, 0.05)}.get(name, (0.0, 0.0))
         compensator.step(reading._replace(values=values), reading.t)
     assert reason in compensator.tare()
     moved = drift if name == "free" else np.zeros(6)

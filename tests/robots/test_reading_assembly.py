@@ -126,6 +126,7 @@ def test_motion_on_another_clock_is_synchronised() -> None:
     late = ReadingAssembler(
         ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
     )
+    assert [same.lag_s, late.lag_s] == pytest.approx([0.5 * 1.8 / 30.0, 0.5 * 1.8 / 30.0 + 0.01])
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
     np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
 

@@ -194,6 +194,15 @@ def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:
     assert any(text.endswith("damaged") for text in messages)
 
 
+def test_lines_without_numbers_are_counted_without_empty_lines() -> None:
+    out, into = os.pipe()
+    line = line_of(readings(1)[0])
+    os.write(into, line + b"\n\n \n" + line + b"\n{}\n" + line + b"\n")
+    os.close(into)
+    assert [each.number for each in JsonLineSource(out, DT).read(1.0)] == [0, 1, -1, 3]
+    os.close(out)
+
+
 TABLES = ("x.csv", "x.parquet")
 
 
