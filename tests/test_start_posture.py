@@ -137,6 +137,19 @@ def test_axis_of_the_last_joint_points_away_from_it(height, axis):
     assert last_joint_axis(replace(arm, table=table)) == axis
 
 
+def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
+    """The motors hold 5 % of the load in the first posture, in neither the whole load."""
+    arm = slave_arm(LoadScenario("touch"))
+    q = np.array([[0.0, -1.2, 1.9, 0.0, 0.9, 0.0], [0.0, 0.1, 1.4, 0.0, 0.1, 0.0]])
+    whole = np.abs([holding_torque(arm, each) for each in q])
+    part = np.abs([holding_torque(arm.with_load(0.05 * arm.phi_load), each) for each in q])
+    limit = (np.maximum(0.5 * (whole[0] + part[0]), part[0]) + 1e-2) / 0.7
+    assert (part[0] < 0.7 * limit).all() and (part[1] > 0.7 * limit).any()
+    assert (whole > 0.7 * limit).any(axis=1).all()
+    weak = replace(arm, effort_limit=limit)
+    np.testing.assert_array_equal(_find_holdable_postures(weak, q), [0])
+
+
 def slave_of(plan, path):
     return Slave(
         model=str(path), sensor_frame="ft", tool=plan.stand_in_tool, home=plan.place.q.tolist()

@@ -85,12 +85,12 @@ def test_letting_go_accelerates_the_device_without_a_method():
 
 
 def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
-    """Each impulse arrives, 0.3 s late; one contact before the evaluated ones is stronger."""
+    """Each impulse arrives, 0.3 s late, but not that of the first contact."""
 
     def run(model, passivity, network, *, intent, **_):
         wall = np.minimum(1e3 * intent[:, 0], 0.0)
-        wall[: 500 + 1000] *= 3.0
         felt = np.concatenate([np.zeros(300), model.force_scale * model.gamma * wall[:-300]])
+        felt[: 500 + 333 + 310] = 0.0
         return SimpleNamespace(
             wall_force=wall,
             hand_force=felt,

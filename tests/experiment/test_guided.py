@@ -93,7 +93,7 @@ SCALED = replace(
     ("condition", "shown"), [(Condition(sigma=0.2), 0.2), (Condition(eta=0.5), 0.5)]
 )
 def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
-    """With eta the object is felt, else the tool; at the hand, both scales reduce the mass."""
+    """The mass is that of the object with eta, else of the tool; both scales reduce it."""
     made = make_apparatus(ApparentMass(), condition, SCALED, None)
     payload = made.scenario.slave.payload.mass
     mass = payload if condition.eta else NominalSlave(SCALED.slave).arm.phi_load[0]

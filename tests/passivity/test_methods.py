@@ -126,7 +126,7 @@ def line(rng: np.random.Generator, steps: int, delay: int = 20, jitter: int = 20
 def test_outputs_are_finite_limited_and_numbered(method):
     rng = np.random.default_rng(1)
     config = PassivityConfig(method=method, force_limit=2.0, torque_limit=0.04)
-    f_e = wrenches(rng, 1500)
+    f_e = wrenches(rng, 1500) * np.repeat([1.0, 10.0], 3)  # the torque reaches its limit, too
     wrench, command, sent, *_ = run(
         method, config, poses(rng, 1500), poses(rng, 1500), f_e, line(rng, 1500)
     )

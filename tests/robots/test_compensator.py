@@ -196,6 +196,37 @@ def test_no_delayed_wrench_is_older_than_a_silence() -> None:
         np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
 
 
+class RestartCounter:
+    """Monitor and contact detector that count restarts."""
+
+    def __init__(self) -> None:
+        self.restarts: list[np.ndarray | None] = []
+
+    def restart(self, offsets: np.ndarray | None = None) -> None:
+        self.restarts.append(offsets)
+
+    def reading_flags(self, values: np.ndarray) -> int:
+        return 0
+
+    def contact_flag(self, values: np.ndarray, contact: np.ndarray) -> int:
+        return 0
+
+
+def test_detectors_restart_after_silence_and_tare() -> None:
+    watch, detector, drift = RestartCounter(), RestartCounter(), np.full(6, 0.01)
+    compensator = Compensator(load(), DT, watch=watch, detector=detector)
+    stream = resting(round(TARE_REST_S / DT) + 30, OFFSETS + drift)
+    for counter in (watch, detector):
+        counter.restarts.clear()
+    for reading in stream:
+        t = reading.t + (0.2 if reading.number >= 30 else 0.0)
+        compensator.step(reading._replace(t=t), t)
+    assert (len(watch.restarts), len(detector.restarts)) == (0, 2)  # also at the first reading
+    assert compensator.tare().startswith("done")
+    assert len(detector.restarts) == 3
+    np.testing.assert_allclose(watch.restarts, [OFFSETS + drift])
+
+
 def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     compensator, delay = Compensator(load(), DT), 0.2
     flags = []

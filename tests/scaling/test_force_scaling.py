@@ -154,6 +154,18 @@ def test_eta_requires_sigma_0_gamma_1_and_a_gripper(config, arm):
         ForceScaling(config, arm, np.eye(3))
 
 
+@pytest.mark.parametrize(("age", "fault"), [(0.049, 0), (0.051, 1), (-0.049, 0), (-0.051, 1)])
+def test_sample_too_old_or_from_the_future_is_a_fault(arm, age, fault):
+    block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
+    context = block.CreateDefaultContext()
+    context.SetTime(3.0)
+    sample = np.concatenate([np.zeros(16), Q, [3.0 - age]])
+    block.GetInputPort("sample").FixValue(context, sample)
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    assert block.GetOutputPort("fault").Eval(context)[0] == fault
+    assert np.isnan(block.GetOutputPort("wrench_B").Eval(context)).all() == bool(fault)
+
+
 def test_new_change_begins_with_the_present_scales(arm):
     block = ForceScaling(ForceScalingConfig(sigma=0.0, gamma=1.0), arm, np.eye(3))
     context = block.CreateDefaultContext()

@@ -11,7 +11,7 @@ import pytest
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import AxisParameters
-from drake_teleop.lab.comparison.delayed_contact import leaf_thickness
+from drake_teleop.lab.comparison.delayed_contact import delayed_contact, leaf_thickness
 from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.tuning import press_trial, search
 from drake_teleop.lab.tuning.press_trial import (
@@ -30,9 +30,11 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.operator.perception import Perception
+from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.slave.plant import NominalSlave
 
 GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
 
@@ -80,6 +82,23 @@ def test_unknown_networks_are_refused():
 
 def test_leaf_of_a_stiffness_has_this_stiffness():
     leaf = SheetSpring(length=0.12, width=0.05, thickness=leaf_thickness(3000.0))
+    assert leaf.stiffness == pytest.approx(3000.0)
+
+
+def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
+    scaled = replace(LoadScenario("contact_transition"), kinematic_scaling__translation_scale=2.0)
+    settings = UNEQUAL, PassivityConfig(method="ledger")
+    setup, task = delayed_contact(scaled, *settings, 3000.0, depth=0.01)
+    swing, press, retreat = setup.operator.intent
+    assert press.translation == pytest.approx([0.0, 0.0, -(0.03 / 2.0 + 0.01)])
+    np.testing.assert_allclose(retreat.translation, np.negative(press.translation))
+    settle = setup.simulation.settle
+    assert swing.t_start == pytest.approx(settle + task.swing_start)
+    assert press.t_start == pytest.approx(settle + task.press_start)
+    assert press.t_start + press.duration == pytest.approx(settle + task.press_end)
+    assert task.press_start == pytest.approx(2.3 + 0.07)
+    leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).start_tip
+    np.testing.assert_allclose(leaf.position, tip - [0.0, 0.0, 0.03])
     assert leaf.stiffness == pytest.approx(3000.0)
 
 
@@ -163,7 +182,8 @@ def test_noise_and_a_force_of_1_n_bound_the_tried_gammas(task, margin, bands):
     """Noise of 0.03 N is accepted up to a gamma of 1.67; a narrower band has less noise."""
     for noise, highest in ((0.03, np.inf), (1e-6, 17.5 * margin)):
         station = FakeStation(limit=np.inf, one_axis_limit=2.2, noise=noise)
-        found = search_settings(trial(task=task), station)
+        heavy = replace_fields(trial(task=task), load_estimate=np.full(16, 100.0))
+        found = search_settings(heavy, station)
         bounds = station.works["search"].gamma_upper_bounds
         expected = {
             f: min(0.05 / noise * np.sqrt(500.0 / f), highest) for f in (500.0, 100.0, 50.0)
@@ -172,7 +192,9 @@ def test_noise_and_a_force_of_1_n_bound_the_tried_gammas(task, margin, bands):
         for row in found.searched_settings:
             if row["method"] == "ledger" and row["low_pass_hz"] == 100.0:
                 gamma = 2.2 / margin
-                swing = row["sigma_inertia"] / 17.5 * 0.02 * (3.0 * np.pi) ** 2 / np.sqrt(2.0)
+                swing = (
+                    row["sigma_inertia"] / 17.5 * 100.0 * 0.02 * (3.0 * np.pi) ** 2 / np.sqrt(2.0)
+                )
                 human = Perception()
                 smallest = max(human.absolute_threshold, human.weber_fraction * swing)
                 felt = smallest + 2.0 * noise * np.sqrt(0.2) * gamma
