@@ -19,6 +19,7 @@ from drake_teleop.load.online.watched import (
     STATE_OTHER_LOAD,
     STATE_SETTLED,
     _force_has_changed,
+    _is_com_within_reach,
     initial_monitor_memory,
     load_state_index,
     monitor_load,
@@ -103,6 +104,15 @@ def prior(grasped):
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
     estimator.update_samples(*rows)
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
+
+
+@pytest.mark.parametrize(("distance", "near"), [(0.9, True), (1.1, False)])
+@pytest.mark.parametrize("mass", [0.5, -0.5])
+def test_grasped_or_released_object_is_within_1_m_of_the_sensor(mass, distance, near):
+    known, new = np.full(16, 3.0), np.full(16, 3.0)
+    new[6] += mass
+    new[7:10] += mass * distance * np.array([0.6, 0.0, -0.8])
+    assert _is_com_within_reach(known, new) == near
 
 
 def test_force_changes_count_after_the_low_pass_has_settled():

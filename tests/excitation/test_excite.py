@@ -45,6 +45,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
+    fusion_gains,
     initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.presets import PRESETS
@@ -390,6 +391,16 @@ def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     np.testing.assert_allclose(
         rest, phi_from_mass_com_inertia(2.1, [0.0, 0.0, 0.08], inertia), atol=1e-9
     )
+
+
+def test_errors_of_fused_accelerations_pass_their_own_filters():
+    sensor, fused, period = WristSensorConfig(), MotionEstimationConfig(source="fused"), 1e-3
+    angular, linear = fusion_gains(fused, sensor, 6, period)
+    noise = sensor_noise(sensor, fused, 6, period)
+    of_s, of_alpha = (denominator for _, denominator in noise.motion_error_filters)
+    np.testing.assert_allclose(of_s[1:] * period, linear)
+    np.testing.assert_allclose(of_alpha[1:] * period, angular)
+    assert np.abs(angular / linear - 1.0).max() > 0.1
 
 
 def test_error_names_an_unreadable_mesh(urdf):
