@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
@@ -19,6 +20,7 @@ from drake_teleop.lab.new_station.place import (
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
+    _jacobian_singular_values,
     degrees_of_freedom,
     elbow_up_share,
     joint_margins,
@@ -31,11 +33,13 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import (
+    IS_PRISMATIC_COLUMN,
     ROTATION_COLUMN,
     TRANSLATION_COLUMN,
     holding_torque,
     pose_into,
 )
+from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.posture_shapes import (
     PostureShapes,
@@ -148,6 +152,19 @@ def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
     assert (whole > 0.7 * limit).any(axis=1).all()
     weak = replace(arm, effort_limit=limit)
     np.testing.assert_array_equal(_find_holdable_postures(weak, q), [0])
+
+
+def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_joints():
+    arm = slave_arm(LoadScenario("touch"))
+    table, step = arm.table.copy(), 1e-6
+    table[[1, 4], IS_PRISMATIC_COLUMN] = 1.0
+    sliding, q = replace(arm, table=table), np.array([0.3, 0.2, 1.1, -0.4, 0.15, 0.6])
+    moved = postures_at(sliding, q + step * np.vstack([np.eye(6), -np.eye(6)]))
+    turns = Rotation.from_matrix(moved.R_WS[:6]) * Rotation.from_matrix(moved.R_WS[6:]).inv()
+    linear = moved.p_WS[:6] - moved.p_WS[6:]
+    columns = np.hstack([linear, orientation_length(sliding) * turns.as_rotvec()]) / (2.0 * step)
+    found = _jacobian_singular_values(sliding, postures_at(sliding, q[np.newaxis]))[0]
+    np.testing.assert_allclose(found, np.linalg.svd(columns, compute_uv=False), atol=1e-8)
 
 
 def slave_of(plan, path):

@@ -19,6 +19,7 @@ from drake_teleop.load.online.watched import (
     STATE_OTHER_LOAD,
     STATE_SETTLED,
     _force_has_changed,
+    _is_at_rest,
     _is_com_within_reach,
     initial_monitor_memory,
     load_state_index,
@@ -104,6 +105,18 @@ def prior(grasped):
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
     estimator.update_samples(*rows)
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
+
+
+@pytest.mark.parametrize(
+    ("omega", "drift", "rests"), [(0.0, 0.0, True), (0.05, 0.0, False), (0.0, 0.5, False)]
+)
+def test_rest_is_300_ms_without_rotation_and_change_of_direction(omega, drift, rests):
+    memory, sample = np.zeros(MEMORY_SIZE), np.zeros(15)
+    for k in range(1000):
+        sample[6:12] = [3.0 + 1e-3 * drift * k, 0.0, 9.3, 0.0, omega, 0.0]
+        found = _is_at_rest(memory, sample, 1e-3)
+        assert found is False or k > 300
+    assert found == rests
 
 
 @pytest.mark.parametrize(("distance", "near"), [(0.9, True), (1.1, False)])

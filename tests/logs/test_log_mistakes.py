@@ -123,6 +123,31 @@ ABOUT_Z = Rotation.from_euler("z", 45, degrees=True).as_matrix()
 TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
 
 
+def described_imu(**changed: dict[str, Any]) -> Description:
+    """Return a description with columns such as "force_x", and other fields of signals."""
+    document: dict[str, Any] = {
+        stream: {"file": "log.csv", "time": {"column": "t"}}
+        | {
+            name: {"columns": [f"{name}_{axis}" for axis in "xyz"]} | changed.get(name, {})
+            for name in FIELDS[stream]
+        }
+        for stream in ("wrench", "imu")
+    }
+    return Description.model_validate(document)
+
+
+def test_axes_of_the_gyroscope_in_another_order_are_named() -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    at = motion_at(t)
+    omega, alpha = at.omega[:, [1, 2, 0]], at.alpha[:, [1, 2, 0]]
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, omega, alpha)
+    (finding,), corrected = check_imu_signals(described_imu(), log)
+    assert finding.name == "swapped axes" and corrected.imu is not None
+    ordered = [f"angular_velocity_{axis}" for axis in "zxy"]
+    assert finding.message.endswith(f"set imu.angular_velocity.columns: {ordered}")
+    assert [*corrected.imu.angular_velocity.columns] == ordered
+
+
 @pytest.mark.parametrize(
     ("omega", "alpha", "unit", "line"),
     [
@@ -135,13 +160,7 @@ def test_unit_of_the_wrong_rate_is_named(omega: float, alpha: float, unit: str, 
     t = np.arange(0.0, 4.0, 0.01)
     at = motion_at(t)
     log = Log(t, np.zeros((len(t), 6)), at.specific_force, omega * at.omega, alpha * at.alpha)
-    document: dict[str, Any] = {
-        stream: {"file": "log.csv", "time": {"column": "t"}}
-        | {name: {"columns": [f"{name}_{axis}" for axis in "xyz"]} for name in FIELDS[stream]}
-        for stream in ("wrench", "imu")
-    }
-    document["imu"]["angular_acceleration"]["unit"] = unit
-    description = Description.model_validate(document)
+    description = described_imu(angular_acceleration={"unit": unit})
     (finding,), corrected = check_imu_signals(description, log)
     assert finding.name == "degrees" and finding.message.endswith(line)
     assert corrected != description

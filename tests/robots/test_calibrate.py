@@ -275,6 +275,18 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     assert recorder.clock_changes <= 2
 
 
+@pytest.mark.parametrize(("degrees", "known"), [(19.0, False), (21.0, True)])
+def test_variance_of_few_degrees_of_freedom_is_not_sufficient(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, degrees: float, known: bool
+) -> None:
+    widths = np.array([0.5]), np.array([0.9]), np.array([degrees])
+    monkeypatch.setattr(
+        "drake_teleop.robots.calibration.half_widths_over_tolerances", lambda *_: widths
+    )
+    at = evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.parquet")
+    assert at.is_within_tolerance.tolist() == [known]
+
+
 def test_progress_shows_values_and_half_widths_in_their_units() -> None:
     tolerance = parse_tolerance("mass 0.5 %, com 0.5 mm")
     found = SimpleNamespace(identification=SimpleNamespace(phi=PHI))

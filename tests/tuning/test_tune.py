@@ -11,7 +11,11 @@ import pytest
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import AxisParameters
-from drake_teleop.lab.comparison.delayed_contact import delayed_contact, leaf_thickness
+from drake_teleop.lab.comparison.delayed_contact import (
+    _slave_heights_and_rotations,
+    delayed_contact,
+    leaf_thickness,
+)
 from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.tuning import press_trial, search
 from drake_teleop.lab.tuning.press_trial import (
@@ -100,6 +104,16 @@ def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
     leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).start_tip
     np.testing.assert_allclose(leaf.position, tip - [0.0, 0.0, 0.03])
     assert leaf.stiffness == pytest.approx(3000.0)
+
+
+def test_rotation_of_the_slave_is_about_the_axes_of_the_world():
+    scenario, t = LoadScenario("contact_transition"), np.arange(3) * 1e-3
+    state = np.tile([0.1, -0.4, 0.9, 0.2, 0.7, -0.3, *np.zeros(6)], (3, 1))
+    state[1:, 0] += [0.1, -0.2]  # about z_W
+    result = SimulationResult(t, {"slave_state": state}, [SIGNALS["slave_state"]])
+    heights, rotations = _slave_heights_and_rotations(result, scenario)
+    np.testing.assert_allclose(rotations, np.outer([0.0, 0.1, -0.2], [0, 0, 1]), atol=1e-12)
+    assert np.ptp(heights) < 1e-12
 
 
 def test_firm_grip_presses_less_deeply_with_a_weak_device():
