@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.style import Picture
-from drake_teleop.lab.reproduction.experiments import identification_values, true_parameters
+from drake_teleop.lab.reproduction.experiments import (
+    identification_values,
+    raw_force_beyond_free_range,
+    true_parameters,
+)
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     compare_with_paper,
@@ -177,3 +181,19 @@ def test_errors_of_the_identified_load_are_those_of_its_parameters():
     assert found["inertia_error_max_g_m2"] == pytest.approx(0.2)
     assert (found["offset_error_N"], found["offset_error_Nm"]) == pytest.approx((0.5, 0.13))
     assert found["mass_std_percent"] == pytest.approx(1.0 / estimate[6])
+
+
+def test_raw_force_is_beyond_its_free_range_on_either_side():
+    t = 0.01 * np.arange(10)
+    free = np.outer(np.linspace(-1.0, 1.0, 10), [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    measured = np.zeros((10, 6))
+    measured[4] = [1.5, -2.75, 0.0, 9.0, 9.0, 9.0]
+    run = SimpleNamespace(
+        contact_result=SimpleNamespace(t=t),
+        in_contact=np.arange(10) == 4,
+        measured_wrench=measured,
+        measured_wrench_free=free,
+    )
+    beyond = raw_force_beyond_free_range(run)
+    np.testing.assert_allclose(beyond[:2], [0.5, 0.75])
+    assert beyond[2] < 0.0

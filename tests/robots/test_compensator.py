@@ -283,6 +283,8 @@ def test_wrong_rate_is_flagged() -> None:
         compensator = Compensator(load(), share * DT)
         flags[share] = [compensator.step(each, each.t).flags for each in readings(300)][-1]
     assert flags == {1.0: 0, 1.2: ReadingFlag.WRONG_RATE}
+    compensator, kept = Compensator(load(), DT), [each for each in readings(600) if each.number % 8]
+    assert not any(compensator.step(each, each.t).flags for each in kept)  # an eighth is lost
 
 
 def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
