@@ -10,6 +10,7 @@ from posed_record import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs import explained_log
 from drake_teleop.logs.causes.candidates import Candidate
 from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
@@ -251,6 +252,26 @@ def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():
         rejected = [Candidate("drift", fit(3.0, ratio), score)]
         found = _variances_of_rejected_causes(fit(0.0, 1.0), rejected)
         np.testing.assert_allclose(found, share * (3.0**2 + 4.0))
+
+
+@pytest.mark.parametrize("longer", [5.0, 0.0])
+def test_samples_near_the_ends_of_wrench_and_poses_are_not_used(monkeypatch, longer):
+    """Knots are 0.2 s apart; the poses are longer than the wrench, or as long."""
+    monkeypatch.setattr(explained_log, "_noise_of_spline_acceleration", lambda splines: 0.0)
+    splines = SimpleNamespace(
+        quaternion=lambda t: Rotation.from_matrix(moving(t)[3]).as_quat(scalar_first=True),
+        position=lambda t: moving(t)[4],
+        motion=lambda t, gravity: moving(t)[:3],
+        poses=SimpleNamespace(t=np.array([T[0] - longer, T[-1] + longer])),
+        spacing=0.2,
+    )
+    posed = SimpleNamespace(gravity_W=GRAVITY_W, poses=SimpleNamespace(position=np.zeros((2, 3))))
+    log = SimpleNamespace(t=T, wrench=np.zeros((len(T), 6)), bridged=None, posed=posed)
+    data = explained_log._spline_instants(log, SimpleNamespace(splines=splines), 0.1)
+    late = 0.0 if longer else 0.1
+    kept = (T[0] + 0.4 <= T) & (T[-1] - 0.4 - late >= T)
+    differs = np.flatnonzero(data.used != kept)
+    assert len(differs) <= 2 and data.used.sum() > 200  # rounding at the borders
 
 
 def test_rows_within_spans_are_marked():
