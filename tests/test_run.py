@@ -8,20 +8,25 @@ import numpy as np
 import polars as pl
 import pytest
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
-from drake_teleop.lab.run_summary import _detection_delays, is_in_contact
+from drake_teleop.lab.run_summary import (
+    _detection_delays,
+    _moving_body_displacements,
+    is_in_contact,
+)
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX, SIGNALS
 
 # The estimator runs in the loop, so no identification is needed.
 QUICK = """
@@ -236,6 +241,35 @@ def test_detector_notices_contact_before_the_operator(tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert f"noticed after {noticed[0]:.1f} ms, at the hand after {at_hand[0]:.1f} ms" in printed
     assert "task_time_s" in printed
+
+
+def test_detection_delays_belong_to_the_contact_before_them():
+    t = 0.01 * np.arange(100)
+    (noticed, at_hand), spans = np.zeros((2, 100)), [(0.2, 0.3), (0.6, 0.7)]
+    noticed[23:28] = noticed[31:33] = noticed[65:75] = noticed[90:] = 1.0
+    at_hand[25:30] = 1.0
+    signals = {"contact": noticed, "contact_at_hand": at_hand}
+    result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
+    assert _detection_delays(result, spans) == {
+        "contact_noticed_ms": pytest.approx([30.0, 50.0]),
+        "contact_at_hand_ms": [pytest.approx(50.0), None],
+        "false_contacts": 1,  # the one at 0.31 s is within 10 ms of the contact
+    }
+
+
+def test_displacement_and_rotation_of_a_moved_body_are_in_mm_and_degrees():
+    class Run(dict):
+        signals = property(list)
+
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1])
+    turned = Rotation.from_rotvec([0.0, 0.3, 0.4]) * turn
+    poses = [
+        [*turn.as_quat(scalar_first=True), 1.0, 2.0, 3.0],
+        [*turned.as_quat(scalar_first=True), 1.003, 2.0, 2.996],
+    ]
+    found = _moving_body_displacements(Run({f"{MOVING_BODY_POSE_PREFIX}block": np.array(poses)}))
+    assert found["moved_mm"] == pytest.approx({"block": 5.0})
+    assert found["turned_deg"] == pytest.approx({"block": np.degrees(0.5)})
 
 
 def test_detection_delay_is_empty_without_contact():

@@ -36,7 +36,9 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
+from drake_teleop.station.slave.joint_control import JointControlConfig
 from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.position_servo import PositionInterface
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -167,6 +169,35 @@ def test_noise_of_the_force_at_rest_is_no_oscillation(seed):
 
 def test_normal_run_has_no_warnings():
     assert run_warnings(recorded(), OVER_NETWORK, ARM) == []
+    assert run_warnings(recorded(pose_received=(0, -2.0)), OVER_NETWORK, ARM) == []  # -q for q
+
+
+def test_command_may_be_late_by_the_delay_of_the_forward_network():
+    channel = Channel(delay=0.4, backward=NetworkConfig(delay=0.01), timeout=0.05)
+    later = {"pose_received": (6, -0.07 * (smooth(T - 0.4) - smooth(T - LATE)))}
+    assert run_warnings(recorded(**later), replace(OVER_NETWORK, channel=channel), ARM) == []
+    swapped = Channel(delay=0.01, backward=NetworkConfig(delay=0.4), timeout=0.05)
+    (warning,) = run_warnings(recorded(**later), replace(OVER_NETWORK, channel=swapped), ARM)
+    assert "more than its delay explains" in warning
+
+
+def test_speed_limit_of_a_position_interface_is_reported():
+    interface = PositionInterface(max_speed=0.5)
+    servo = JointControlConfig(servo="position", interface=interface)
+    fast = recorded(joint_command=(0, 0.06 * during(2.0, 2.1)))  # 0.57 rad/s
+    (warning,) = run_warnings(fast, replace(OVER_NETWORK, joint_control=servo), ARM)
+    assert "joint 1 is at its largest speed from 2.000 to 2.100 s" in warning
+
+
+def test_fault_at_the_hand_is_reported_unless_the_slave_has_one():
+    run, faults = recorded(), {"fault": 2.0 * during(1, 2), "fault_at_hand": 5.0 * during(1.5, 3)}
+    signals = {name: run[name] for name in run} | {k: v[:, None] for k, v in faults.items()}
+    order = [SIGNALS[name] for name in SIGNALS if name in signals]
+    found = run_warnings(SimulationResult(T, signals, order), OVER_NETWORK, ARM)
+    assert [each.rpartition("from ")[2] for each in found] == [
+        "1.000 to 2.000 s",
+        "2.001 to 3.000 s",
+    ]
 
 
 def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
@@ -254,9 +285,10 @@ def test_further_times_are_counted():
 def test_lag_of_prismatic_joint_is_in_millimetres():
     sliding = dataclasses.replace(ARM, table=ARM.table.copy())
     sliding.table[5, IS_PRISMATIC_COLUMN] = 1.0
-    late = recorded(slave_state=(5, 0.01 * during(1, 1.5)))
+    late = recorded(slave_state=(5, 0.003 * during(1, 1.5)))
     (warning,) = run_warnings(late, OVER_NETWORK, sliding)
-    assert "joint 6 is up to 10.0 mm behind" in warning
+    assert "joint 6 is up to 3.0 mm behind" in warning
+    assert run_warnings(late, OVER_NETWORK, ARM) == []
     assert (
         run_warnings(recorded(slave_state=(5, 0.001 * during(1, 1.5))), OVER_NETWORK, sliding) == []
     )

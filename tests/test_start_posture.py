@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.new_station.place import (
     _find_holdable_postures,
     _order_postures_to_solve,
     find_start_place,
+    last_joint_axis,
 )
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
+    _jacobian_singular_values,
     degrees_of_freedom,
     elbow_up_share,
     joint_margins,
@@ -28,7 +32,14 @@ from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.slave.arm import holding_torque, pose_into
+from drake_teleop.station.slave.arm import (
+    IS_PRISMATIC_COLUMN,
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
+    holding_torque,
+    pose_into,
+)
+from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.posture_shapes import (
     PostureShapes,
@@ -106,6 +117,54 @@ def plain(tmp_path_factory):
 
 def elbow_of(plan):
     return elbow_up_share(postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+
+
+def test_offset_of_a_nearly_straight_arm_has_no_direction():
+    origins = np.zeros((3, 3, 3))
+    origins[:, 2] = [0.0, 0.0, 1.0]
+    origins[:, 1] = [[0.02, 0.0, 0.5], [0.3, 0.0, 0.5], [0.0, -0.3, 0.5]]
+    origins[2, 2] = [0.8, 0.0, 0.6]
+    postures = Postures(*[np.zeros((3, 3))], origins, origins, np.zeros((3, 3, 3)), origins[:, 2])
+    line = np.array([0.8, 0.0, 0.6])
+    offset = origins[2, 1] - (origins[2, 1] @ line) * line
+    expected = [1.0, 0.0, offset[2] / np.linalg.norm(offset)]
+    np.testing.assert_allclose(elbow_up_share(postures, 1.0), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("height", "axis"), [(0.1, "y"), (0.0, "y"), (-0.1, "-y")])
+def test_axis_of_the_last_joint_points_away_from_it(height, axis):
+    arm = slave_arm(LoadScenario("touch"))
+    table = arm.table.copy()
+    row = table[arm.num_joints]
+    row[ROTATION_COLUMN:TRANSLATION_COLUMN] = [0, 0, 1, 1, 0, 0, 0, 1, 0]
+    row[TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3] = [0.2, -0.3, height]
+    assert last_joint_axis(replace(arm, table=table)) == axis
+
+
+def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
+    """The motors hold 5 % of the load in the first posture, in neither the whole load."""
+    arm = slave_arm(LoadScenario("touch"))
+    q = np.array([[0.0, -1.2, 1.9, 0.0, 0.9, 0.0], [0.0, 0.1, 1.4, 0.0, 0.1, 0.0]])
+    whole = np.abs([holding_torque(arm, each) for each in q])
+    part = np.abs([holding_torque(arm.with_load(0.05 * arm.phi_load), each) for each in q])
+    limit = (np.maximum(0.5 * (whole[0] + part[0]), part[0]) + 1e-2) / 0.7
+    assert (part[0] < 0.7 * limit).all() and (part[1] > 0.7 * limit).any()
+    assert (whole > 0.7 * limit).any(axis=1).all()
+    weak = replace(arm, effort_limit=limit)
+    np.testing.assert_array_equal(_find_holdable_postures(weak, q), [0])
+
+
+def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_joints():
+    arm = slave_arm(LoadScenario("touch"))
+    table, step = arm.table.copy(), 1e-6
+    table[[1, 4], IS_PRISMATIC_COLUMN] = 1.0
+    sliding, q = replace(arm, table=table), np.array([0.3, 0.2, 1.1, -0.4, 0.15, 0.6])
+    moved = postures_at(sliding, q + step * np.vstack([np.eye(6), -np.eye(6)]))
+    turns = Rotation.from_matrix(moved.R_WS[:6]) * Rotation.from_matrix(moved.R_WS[6:]).inv()
+    linear = moved.p_WS[:6] - moved.p_WS[6:]
+    columns = np.hstack([linear, orientation_length(sliding) * turns.as_rotvec()]) / (2.0 * step)
+    found = _jacobian_singular_values(sliding, postures_at(sliding, q[np.newaxis]))[0]
+    np.testing.assert_allclose(found, np.linalg.svd(columns, compute_uv=False), atol=1e-8)
 
 
 def slave_of(plan, path):

@@ -13,6 +13,10 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.solids import Block, Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.joint_control import mass_matrix
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Payload
 
 
 def test_device_mass_if_only_the_inner_link_moves():
@@ -69,6 +73,27 @@ def test_free_slave_is_lighter_than_a_guided_one(direction):
     assert 3.13 * task.tool_coupling < task.axis.slave_mass
     if direction == (0, 0, 1):
         assert task.tool_coupling == pytest.approx(1.0, abs=1e-3)
+
+
+def test_masses_agree_with_jacobians_by_finite_differences():
+    """The payload is beside the axis of the tool, and the direction is oblique."""
+    payload = Payload(mass=2.0, com=[0.08, -0.05, 0.1])
+    scenario = replace(LoadScenario("free_motion_force"), slave__payload=payload)
+    slave, n_W = NominalSlave(scenario.slave), np.array([1.0, -2.0, 0.5]) / np.sqrt(5.25)
+    arm = slave.arm
+
+    def tip_and_com(q):
+        R, p = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(arm.table, q, R, p)
+        return np.array([p + R @ slave.tip, p + R @ arm.phi_load[1:4] / arm.phi_load[0]])
+
+    steps = 1e-6 * np.eye(6)
+    J = np.array([tip_and_com(slave.start + x) - tip_and_com(slave.start - x) for x in steps])
+    of_tip, of_com = np.einsum("jpi,i->pj", J / 2e-6, n_W)
+    rate = np.linalg.solve(mass_matrix(arm, slave.start), of_tip)
+    task = task_direction(scenario, n_W)
+    assert task.axis.slave_mass == pytest.approx(1.0 / (of_tip @ rate), rel=1e-6)
+    assert task.tool_coupling == pytest.approx((of_com @ rate) / (of_tip @ rate), rel=1e-6)
 
 
 def test_master_direction_follows_the_alignment():

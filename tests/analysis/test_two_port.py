@@ -146,6 +146,13 @@ def test_absorbed_impedances_replace_hand_and_environment():
     np.testing.assert_allclose(tp.transmitted_impedance(inside, there), whole, rtol=1e-9)
 
 
+def test_ideal_station_has_no_reflections_at_the_reference_impedances():
+    axis = OneAxis(force_scale=0.1, position_scale=3.0, hand_damping=8.0)
+    ideal = tp.two_port_matrix(0.0, axis.force_scale, -axis.position_scale, 0.0)
+    S = tp.scattering_matrix(ideal, tp.reference_impedances(axis))
+    np.testing.assert_allclose([S[0, 0], S[1, 1]], 0.0, atol=1e-15)
+
+
 def test_scattering_relates_the_waves():
     H = random_two_ports(200)
     V_m, F_e = np.random.default_rng(8).normal(size=(2, 200)) + 0.3j

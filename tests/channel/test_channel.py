@@ -11,12 +11,17 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
 from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.channel_side import MakeChannel, _adapt_passivity_to_device
+from drake_teleop.station.channel_side import (
+    MakeChannel,
+    _adapt_passivity_to_device,
+    slave_wrench_power_scale,
+)
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.memory import LAST_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -57,6 +62,19 @@ def test_ledger_has_the_encoder_steps_of_the_device():
     assert steps["geomagic_touch"][0] == pytest.approx(5.5e-5, rel=0.02)
     own = PassivityConfig(ledger=LedgerConfig(encoder_step=[2e-4, 1e-3]))
     assert _adapt_passivity_to_device(scenario, own).ledger.encoder_step == [2e-4, 1e-3]
+
+
+@pytest.mark.parametrize(("gamma", "rendered"), [(0.5, 0.05), (0.0, 0.1)])
+def test_slave_power_is_scaled_by_the_rendered_share_over_the_motion(gamma, rendered):
+    """A scale of motion of 0 counts as 1, as does a gamma of 0."""
+    for scales, expected in (((4.0, 0.5), (4.0, 0.5)), ((2.0, 0.0), (2.0, 1.0))):
+        scenario = replace(
+            Scenario(),
+            force_scaling=ForceScalingConfig(gamma=gamma, force_scale=0.1),
+            kinematic_scaling=KinematicScalingConfig(*scales),
+        )
+        found = slave_wrench_power_scale(scenario)
+        np.testing.assert_allclose(found, rendered / np.array(expected))
 
 
 def moving(**changes: object) -> Scenario:

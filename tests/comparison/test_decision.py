@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from drake_teleop.lab.comparison import release_and_taps
 from drake_teleop.lab.comparison.decision import decision_table
+from drake_teleop.lab.comparison.one_dof import ACTUAL
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.comparison.report import draw_decision_table, draw_energy, draw_force_traces
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
@@ -75,6 +82,29 @@ def test_letting_go_accelerates_the_device_without_a_method():
     for shown in (none, simulate_release_and_taps("none", "geostationary")):
         assert shown.tap_shares == pytest.approx((1.0, 1.0), abs=0.02)
     assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
+
+
+def test_impulses_count_from_the_delay_of_one_way(monkeypatch):
+    """Each impulse arrives, 0.3 s late, but not that of the first contact."""
+
+    def run(model, passivity, network, *, intent, **_):
+        wall = np.minimum(1e3 * intent[:, 0], 0.0)
+        felt = np.concatenate([np.zeros(300), model.force_scale * model.gamma * wall[:-300]])
+        felt[: 500 + 333 + 310] = 0.0
+        return SimpleNamespace(
+            wall_force=wall,
+            hand_force=felt,
+            master_position=intent[:, 0],
+            least_energy_sum=lambda place: -0.1 * place,
+        )
+
+    monkeypatch.setattr(release_and_taps, "run_one_dof", run)
+    monkeypatch.setitem(release_and_taps.PRESETS, "late", NetworkConfig(delay=0.3))
+    monkeypatch.setattr(release_and_taps, "Channel", lambda **_: Channel())
+    monkeypatch.setattr(release_and_taps, "TAP_RATES_HZ", (1.5,))
+    found = simulate_release_and_taps("none", "late")
+    assert found.tap_shares == pytest.approx((1.0,), abs=1e-9)
+    assert found.leaked == pytest.approx(0.1 * ACTUAL)
 
 
 @pytest.mark.parametrize("draw", [draw_force_traces, draw_energy])

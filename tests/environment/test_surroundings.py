@@ -11,6 +11,14 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.yaml import yaml_load
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    SpatialInertia,
+)
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
@@ -182,6 +190,39 @@ def test_bodies_move_smoothly_between_two_states():
         poses_and_twists_into(joints, state(0.1 + u * h), expected)
         np.testing.assert_allclose(poses[:, :7], expected[:, :7], atol=1e-9)
         np.testing.assert_allclose(poses[:, 7:], expected[:, 7:], atol=2e-6)
+
+
+def test_chain_of_all_joints_moves_as_in_drake():
+    """Floating, revolute and prismatic joint, all between rotated frames."""
+    plant, rng = MultibodyPlant(0.0), np.random.default_rng(3)
+    above, bodies = plant.world_frame(), []
+    for name, joint in (
+        ("floats", QuaternionFloatingJoint),
+        ("turns", lambda *ends: RevoluteJoint(*ends, [0.6, 0.0, 0.8])),
+        ("slides", lambda *ends: PrismaticJoint(*ends, [0.0, -0.8, 0.6])),
+    ):
+        body = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        ends = []
+        for frame in (above, body.body_frame()):
+            offset = RigidTransform(RollPitchYaw(*rng.normal(size=3)), rng.normal(size=3))
+            end = FixedOffsetFrame(f"{name}_{len(ends)}", frame, offset)
+            ends.append(plant.AddFrame(end))
+        plant.AddJoint(joint(f"{name}_joint", *ends))
+        above = body.body_frame()
+        bodies.append(body)
+    plant.Finalize()
+    context, state = plant.CreateDefaultContext(), rng.normal(size=17)
+    state[:4] /= np.linalg.norm(state[:4])
+    plant.SetPositionsAndVelocities(context, state)
+    joints, _ = MakeJointTable(plant, [body.index() for body in bodies])
+    found = np.empty((3, 13))
+    poses_and_twists_into(joints, state, found)
+    for row, body in zip(found, bodies, strict=True):
+        X = plant.EvalBodyPoseInWorld(context, body)
+        V = plant.EvalBodySpatialVelocityInWorld(context, body)
+        assert abs(row[:4] @ X.rotation().ToQuaternion().wxyz()) == pytest.approx(1.0)
+        expected = [X.translation(), V.rotational(), V.translational()]
+        np.testing.assert_allclose(row[4:], np.concatenate(expected), atol=1e-12)
 
 
 @pytest.fixture(scope="module")

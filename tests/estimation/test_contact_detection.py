@@ -10,9 +10,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.lab.run_summary import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import ContactDetector
+from drake_teleop.load.contact.detection import CONTACT_END_LEVEL, CUSUM_SLACK, ContactDetector
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.regressor import SATURATION_FLAG_INDEX, non_contact_wrench
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.estimation.contact_detection import (
     ContactDetection,
@@ -43,6 +43,26 @@ def floor() -> NoiseFloor:
         np.full(6, 0.2),
         free_maxima=np.array([5.0, 8.0, 6.0]),
     )
+
+
+def test_settings_in_seconds_reach_the_detector_in_samples(arm):
+    times = {"hold": 0.03, "drift_time": 2.0, "recovery": 0.007}
+    config = ContactDetectionConfig(statistic="cusum", margin=1.5, **times)
+    block = ContactDetection(config, floor(), arm, 1e-3)
+    expected = CUSUM_SLACK, 1e-3 / 2.0, 1, 1.5 * 8.0, CONTACT_END_LEVEL, 30
+    assert block._settings[1] == expected and block._recovery == 7
+
+
+def test_saturated_sample_and_the_recovery_after_it_keep_the_flag(arm):
+    block = ContactDetection(ContactDetectionConfig(recovery=3e-3), floor(), arm, 1e-3)
+    context, sample, flags = block.CreateDefaultContext(), np.zeros(16 + 6 + 1), []
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    for k in range(8):
+        sample[0], sample[SATURATION_FLAG_INDEX] = (90.0, float(k == 1)) if k else (0.0, 0.0)
+        block.GetInputPort("sample").FixValue(context, sample)
+        context.SetDiscreteState(block.EvalUniquePeriodicDiscreteUpdate(context))
+        flags.append(block.GetOutputPort("contact").Eval(context)[0])
+    assert flags == [0, 0, 0, 0, 0, 1, 1, 1]
 
 
 @pytest.mark.parametrize("statistic", ["level", "glr"])

@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
-from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.regressor import SATURATION_FLAG_INDEX, non_contact_wrench
 from drake_teleop.station.estimation.load_estimator import LoadEstimator, LoadEstimatorConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig, butterworth_sections
 
@@ -103,6 +103,15 @@ def test_given_load_stays_until_the_first_update():
         history = run(MakeEstimator(known, method=method), still)
         np.testing.assert_allclose(history[-1, :16], known, rtol=1e-9)
         assert history[-1, 16] == 0.0
+
+
+def test_saturated_samples_are_not_used_and_the_fallback_is_kept():
+    known, rows = np.concatenate([SENSOR.offset, PHI]), samples(0, 0.2)
+    rows[:, SATURATION_FLAG_INDEX] = 1.0
+    np.testing.assert_array_equal(run(MakeEstimator(known), rows)[-1, :16], known)
+    config, noise = LoadEstimatorConfig(watch=True), (SENSOR.wrench_std(), SENSOR.motion_std())
+    block = LoadEstimator(config, *noise, 1e-3, 22, known, np.eye(16), 0.5 * PHI)
+    np.testing.assert_array_equal(block._watch_arguments[0], 0.5 * PHI)
 
 
 def test_total_least_squares_removes_the_bias_of_acceleration_noise():

@@ -13,10 +13,14 @@ from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import (
     LOAD_FADE_TIME_S,
+    MEMORY_SIZE,
     STATE_DISTURBED,
     STATE_LEARNING,
     STATE_OTHER_LOAD,
     STATE_SETTLED,
+    _force_has_changed,
+    _is_at_rest,
+    _is_com_within_reach,
     initial_monitor_memory,
     load_state_index,
     monitor_load,
@@ -101,6 +105,37 @@ def prior(grasped):
     rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
     estimator.update_samples(*rows)
     return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
+
+
+@pytest.mark.parametrize(
+    ("omega", "drift", "rests"), [(0.0, 0.0, True), (0.05, 0.0, False), (0.0, 0.5, False)]
+)
+def test_rest_is_300_ms_without_rotation_and_change_of_direction(omega, drift, rests):
+    memory, sample = np.zeros(MEMORY_SIZE), np.zeros(15)
+    for k in range(1000):
+        sample[6:12] = [3.0 + 1e-3 * drift * k, 0.0, 9.3, 0.0, omega, 0.0]
+        found = _is_at_rest(memory, sample, 1e-3)
+        assert found is False or k > 300
+    assert found == rests
+
+
+@pytest.mark.parametrize(("distance", "near"), [(0.9, True), (1.1, False)])
+@pytest.mark.parametrize("mass", [0.5, -0.5])
+def test_grasped_or_released_object_is_within_1_m_of_the_sensor(mass, distance, near):
+    known, new = np.full(16, 3.0), np.full(16, 3.0)
+    new[6] += mass
+    new[7:10] += mass * distance * np.array([0.6, 0.0, -0.8])
+    assert _is_com_within_reach(known, new) == near
+
+
+def test_force_changes_count_after_the_low_pass_has_settled():
+    memory, period, found = np.zeros(MEMORY_SIZE), 1e-3, []
+    for age in range(600):
+        force = 2.0 if age < 5 else 1.0 if age >= 300 else 0.0
+        residual = np.array([0.0, force, 0.0, 0.0, 0.0, 0.0])
+        found.append(_force_has_changed(memory, residual, float(age), period))
+    changed = 300 + round(1e3 * 0.05 * np.log(2.0))  # the low-pass reaches 0.5 N
+    assert not any(found[: changed + 90]) and all(found[changed + 110 :])
 
 
 def time_of(result, state, after=0.0):
@@ -205,6 +240,19 @@ def monitor_samples(prior, rows, fallback=None):
         monitor_load(out, memory, row, rest, 1e-3, *options)
         handed[k], states[k] = out, load_state_index(memory)
     return handed, states
+
+
+@pytest.mark.parametrize(("force", "torque"), [(0.25, 0.0), (0.4, 0.0), (0.0, 0.01), (0.0, 0.025)])
+def test_offsets_follow_residuals_of_a_drift_and_not_of_a_touch(force, torque):
+    """Limits are 0.3 N and 0.015 N m; a light touch is hardly noticed."""
+    theta = np.concatenate([np.zeros(6), OBJECT])
+    variances = [*3 * [1e-4], *3 * [1e-7], *(2e-5 * OBJECT**2 + 1e-10)]
+    added = np.zeros((3000, 6))
+    added[500:] = [force, 0.0, 0.0, torque, 0.0, 0.0]
+    handed, states = monitor_samples((theta, np.diag(variances)), at_rest(theta, added, 0))
+    assert (states == STATE_SETTLED).mean() > 0.5
+    share = np.linalg.norm(handed[-1, :6]) / max(force, torque)
+    assert 0.4 < share < 0.8 if force < 0.3 and torque < 0.015 else share < 0.2
 
 
 def test_offsets_are_kept_at_rest(prior):

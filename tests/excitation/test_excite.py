@@ -36,7 +36,7 @@ from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.lab.identification import identify_load
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -45,6 +45,7 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_sample_into,
+    fusion_gains,
     initialize_motion_estimator,
 )
 from drake_teleop.station.sensor.presets import PRESETS
@@ -377,7 +378,12 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
 
 
 def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
-    robot = RobotFromModel(urdf, "l6", WristSensorConfig())
+    ranges = {"force_range": [300.0, 100.0, 200.0], "torque_range": [20.0, 30.0, 12.0]}
+    sensor = WristSensorConfig(**ranges, acceleration_range=40.0, angular_acceleration_range=90.0)
+    robot = RobotFromModel(urdf, "l6", sensor)
+    np.testing.assert_allclose(robot.limits.max_sensor_norms, [90.0, 10.0, 40.0, 90.0])
+    noise = robot.criterion_scales.wrench_noise
+    assert noise == pytest.approx(sensor.wrench_std()[[0, 3]])
     assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
     words = "; ".join(robot.assumptions)
     assert "turns without end for j4" in words
@@ -396,7 +402,22 @@ def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     )  # fmt: skip
     assert "shapes are missing of l4: meshes" in "; ".join(found.assumptions)
     np.testing.assert_array_equal(found.limits.acceleration, np.full(6, 5.0))
-    assert found.limits.heaviest_phi[0] == pytest.approx(3.0)
+    # The rest of the payload is at 80 mm with a radius of gyration of 50 mm.
+    rest = found.limits.heaviest_phi - robot.limits.heaviest_phi / 1.3
+    inertia = 2.1 * 0.05**2 * 2 / 3 * np.eye(3)
+    np.testing.assert_allclose(
+        rest, phi_from_mass_com_inertia(2.1, [0.0, 0.0, 0.08], inertia), atol=1e-9
+    )
+
+
+def test_errors_of_fused_accelerations_pass_their_own_filters():
+    sensor, fused, period = WristSensorConfig(), MotionEstimationConfig(source="fused"), 1e-3
+    angular, linear = fusion_gains(fused, sensor, 6, period)
+    noise = sensor_noise(sensor, fused, 6, period)
+    of_s, of_alpha = (denominator for _, denominator in noise.motion_error_filters)
+    np.testing.assert_allclose(of_s[1:] * period, linear)
+    np.testing.assert_allclose(of_alpha[1:] * period, angular)
+    assert np.abs(angular / linear - 1.0).max() > 0.1
 
 
 def test_error_names_an_unreadable_mesh(urdf):

@@ -9,8 +9,13 @@ import pytest
 
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.experiment.apparatus import make_apparatus
-from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.live.experiment.apparatus import IntervalLog, make_apparatus
+from drake_teleop.live.experiment.design import (
+    ApparentMass,
+    Condition,
+    ContactDetection,
+    Experiment,
+)
 from drake_teleop.live.experiment.guided import (
     HAND_INPUTS,
     GuidedExperiment,
@@ -20,6 +25,7 @@ from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.session import read_drive
 from drake_teleop.load.identification import Identification
+from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
@@ -74,6 +80,61 @@ class Participant:
         for _ in range(3):
             self.send(go=True)
         assert self.procedure.phase == "interval"
+
+
+SCALED = replace(
+    LoadScenario("touch"),
+    kinematic_scaling__translation_scale=2.0,
+    force_scaling__force_scale=0.1,
+)
+
+
+@pytest.mark.parametrize(
+    ("condition", "shown"), [(Condition(sigma=0.2), 0.2), (Condition(eta=0.5), 0.5)]
+)
+def test_stimulus_and_measured_level_of_a_mass_agree(condition, shown):
+    """The mass is that of the object with eta, else of the tool; both scales reduce it."""
+    made = make_apparatus(ApparentMass(), condition, SCALED, None)
+    payload = made.scenario.slave.payload.mass
+    mass = payload if condition.eta else NominalSlave(SCALED.slave).arm.phi_load[0]
+    assert payload > 0.0 or condition.eta is None
+    assert made.load_mass_at_hand == pytest.approx(mass * 0.1 * 2.0)
+    level = 0.3 * made.load_mass_at_hand
+    inputs = made.stimulus_inputs(level, 8.0)
+    assert inputs["sigma_object"] == round(100 * (shown + 0.3)) and inputs["gamma"] == 100
+    assert inputs["sigma"] == (0 if condition.eta else inputs["sigma_object"])
+    assert made.stimulus_inputs(0.0, 8.0)["sigma_object"] == round(100 * shown)
+    rows = IntervalLog(SCALED, None)
+    assert made.interval_result(level, inputs, rows).level == pytest.approx(level)
+    assert made.interval_result(0.0, inputs, rows).level == 0.0
+
+
+def test_stimulus_and_measured_level_of_a_contact_agree():
+    made = make_apparatus(ContactDetection(), Condition(sigma=0.2, gamma=2.0), SCALED, None)
+    assert made.stimulus_inputs(0.0, 8.0) == {"sigma": 20, "sigma_object": 20, "gamma": 0}
+    inputs = made.stimulus_inputs(3.0, 8.0)
+    assert inputs["gamma"] == 75  # 3/8 of 200 %
+    for force, valid in ((6.0, True), (0.4, False)):
+        rows = IntervalLog(SCALED, None)
+        contact = np.tile([0.0, 0.0, -force, 1.0, 1.0, 1.0], (200, 1))
+        t, shown = 1e-3 * np.arange(200), np.zeros((200, 6))
+        rows.add_rows({"t": t, "true_contact_wrench_W": contact, "force_to_master": shown})
+        result = made.interval_result(3.0, inputs, rows)
+        assert result.level == pytest.approx(force * 3.0 / 8.0)
+        assert (result.valid, result.force_N) == (valid, pytest.approx(force))
+
+
+@pytest.mark.parametrize(("height", "done"), [(0.04, True), (0.037, False), (0.0, False)])
+def test_peg_is_done_after_200_ms_on_the_floor(height, done):
+    """The mouth of a slot of 40 mm is `height` above the tip."""
+    slave = NominalSlave(SCALED.slave)
+    rows = IntervalLog(SCALED, Insert(translation=[0.0, 0.0, height], depth=0.04))
+    state = np.concatenate([slave.start, np.zeros(6)])
+    for t in (0.1, 0.2, 0.29, 0.31):
+        rows.add_rows(
+            {"t": [t], "force_to_master": np.zeros((1, 6)), "slave_state": state[np.newaxis]}
+        )
+        assert rows.done_at == (0.1 if done and t > 0.3 else 0.0)
 
 
 @pytest.mark.long

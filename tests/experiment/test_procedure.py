@@ -42,7 +42,8 @@ def run_participant(procedure: Procedure, rng, threshold: float, most: int = 10_
     """Run a participant whose answers depend on the level, or until a number of trials."""
     while procedure.phase != "end" and procedure.trial_number < most:
         if procedure.phase == "interval":
-            result = IntervalResult(procedure.current_level, force_N=5.0, done=True, time_s=1.0)
+            force = 5.0 if isinstance(procedure.task, ContactDetection) else 50.0
+            result = IntervalResult(procedure.current_level, force, done=True, time_s=1.0)
             procedure.finish_interval(result)
         elif procedure.phase == "gap":
             procedure.start_second_interval()
@@ -135,6 +136,13 @@ def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_p
     run_participant(procedure, np.random.default_rng(0), 2.0)
     counted = [row for row in TrialStore(tmp_path).read_rows(1) if not row.practice]
     assert len(counted) == 3 * (6 + 5 + 2)
+
+
+def test_expected_contact_force_is_the_median_of_contact_trials(tmp_path):
+    few = [ContactDetection(trials=1, practice=0), *SMALL.tasks[1:]]
+    procedure = Procedure(dataclasses.replace(SMALL, tasks=few), 1, TrialStore(tmp_path))
+    run_participant(procedure, np.random.default_rng(0), 2.0)
+    assert procedure.expected_contact_force == 5.0
 
 
 def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):

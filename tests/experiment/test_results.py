@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ from drake_teleop.live.experiment.results import (
     compute_results,
     write_results,
 )
+from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
+from drake_teleop.station.scenario import Scenario
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -35,6 +38,22 @@ def test_table_contains_the_true_thresholds(tmp_path):
     assert sum(r.low <= 2.0 <= r.high for r in each) >= 4
     for over in (r for r in found if not r.participant):
         assert over.low < 2.0 < over.high < 2.0 * over.low
+
+
+def test_intervals_have_different_random_numbers():
+    seeds = {
+        with_interval_seed(
+            Scenario(),
+            SimpleNamespace(
+                trial_number=trial, interval=k, participant=person, experiment=Experiment(seed=seed)
+            ),
+        ).simulation.seed
+        for trial in range(4)
+        for k in (1, 2)
+        for person in (1, 2)
+        for seed in (0, 1)
+    }
+    assert len(seeds) == 32
 
 
 @pytest.mark.pictures

@@ -14,6 +14,7 @@ from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
+from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
 from drake_teleop.live.device_client import DeviceClient
 from drake_teleop.live.device_guard import DeviceGuard, DeviceLimits
 from drake_teleop.live.device_link import DeviceConnection, DeviceLink
@@ -196,6 +197,27 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
     assert "clutch" not in link.hand_inputs(0.2801)
     other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
     assert link.hand_inputs(0.29)["clutch"] == 0
+
+
+def test_rotation_is_about_the_base_axes_and_the_new_origin_opens_the_clutch(link):
+    sender, start = Sender(link.port), (0.5, 0.5, -0.5, 0.5)
+    sender.send(100, quaternion_wxyz=start)
+    link.hand_inputs(0.0)
+    turned = quaternion_product(quaternion_exponential((0.3, -0.1, 0.2)), start)
+    sender.send(101, (0.01, -0.02, 0.03), quaternion_wxyz=turned)
+    inputs = link.hand_inputs(0.04)
+    assert [inputs[name] for name in ("x", "y", "z")] == pytest.approx([1e3, -2e3, 3e3])
+    assert [inputs[name] for name in ("rx", "ry", "rz")] == pytest.approx([3e3, -1e3, 2e3])
+    sender.send(102, (0.01, -0.02, 0.03), quaternion_wxyz=turned)
+    assert "clutch" not in link.hand_inputs(0.08)
+    link.reset_pose_origin(0.09)
+    sender.send(103, (0.01, -0.02, 0.03), quaternion_wxyz=turned)
+    inputs = link.hand_inputs(0.1)
+    assert inputs.pop("clutch") == 0 and inputs.pop("held") == 1
+    assert list(inputs.values()) == pytest.approx([0.0] * 6, abs=1e-9)
+    sender.send(5000)  # after silence, on another clock
+    link.hand_inputs(0.3)
+    assert link.link_statistics(0.3)["late_p99_ms"] == 0.0
 
 
 def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RollPitchYaw
 
 from drake_teleop.live.external_master import (
     _ALLOWED_SHARE_INDEX,
     _DISPLAY_STATE_SIZE,
     _FAULT_INDEX,
+    ExternalMaster,
     MakeExternalMasterSide,
     _update_displayed_wrench,
 )
@@ -57,3 +59,20 @@ def test_side_of_a_real_device_has_the_limits_of_the_device(model):
     limits = side.GetSubsystemByName("live_hand")._limits
     np.testing.assert_array_equal(limits, [device.peak_force, max(device.peak_torque)])
     assert limits[0] > 2.0 * limits[1]
+
+
+def test_state_has_position_yaw_pitch_roll_and_twist_of_the_path():
+    start, end = np.array([1.0, 0, 0, 0, 0.1, 0.2, 0.3]), [0.11, 0.18, 0.33]
+    master = ExternalMaster(start, PERIOD, np.ones(2))
+    context = master.CreateDefaultContext()
+    context.SetTime(1.0)
+    turn = RollPitchYaw(0.1, -0.2, 0.3)
+    master.SetTarget(context, np.array([*turn.ToQuaternion().wxyz(), *end]))
+    twist = master.GetOutputPort("twist_master").Eval(context)
+    rotation = turn.ToRotationMatrix().ToAngleAxis()
+    np.testing.assert_allclose(twist[:3], np.subtract(end, start[4:]) / 2e-3)
+    np.testing.assert_allclose(twist[3:], rotation.angle() * rotation.axis() / 2e-3)
+    context.SetTime(1.002)
+    state = master.GetOutputPort("master_state").Eval(context)
+    np.testing.assert_allclose(state, [*end, 0.3, -0.2, 0.1, *np.zeros(6)], atol=1e-12)
+    assert not master.GetOutputPort("twist_master").Eval(context).any()

@@ -12,7 +12,7 @@ from drake_teleop.common.vectors import (
     quaternion_product,
 )
 from drake_teleop.live.hand import LiveHand
-from drake_teleop.station.operator.operator import OperatorConfig
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES, OperatorConfig
 
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 #: Time [s], rotation vector [rad] and position [m] of targets, with different axes.
@@ -26,8 +26,8 @@ TARGETS = (
 class MovingHand:
     """Hand on a stylus at rest."""
 
-    def __init__(self) -> None:
-        self.hand = LiveHand(OperatorConfig(), START)
+    def __init__(self, grip: str = "medium") -> None:
+        self.hand = LiveHand(OperatorConfig(grip=grip), START)
         self.context = self.hand.CreateDefaultContext()
         self.hand.GetInputPort("pose_master").FixValue(self.context, START)
         self.hand.GetInputPort("twist_master").FixValue(self.context, np.zeros(6))
@@ -73,6 +73,26 @@ def test_new_target_keeps_position_velocity_and_acceleration(moving_hand, angle)
     np.testing.assert_allclose(then[2], twist, rtol=0, atol=1e-9)
     assert np.linalg.norm(acceleration) > 5.0
     np.testing.assert_allclose(then[3], acceleration, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("before", "after"), [("light", "firm"), ("firm", "light")])
+def test_change_of_the_grip_keeps_the_wrench(moving_hand, before, after):
+    orientation, position, twist, _ = moving_hand.intention(0.11)
+    turn = quaternion_exponential((0.05, -0.1, 0.08))
+    pose = [*quaternion_product(turn, tuple(orientation)), *np.add(position, (0.01, -0.02, 0.03))]
+    path = moving_hand.context.get_numeric_parameter(0).CopyToVector()
+    wrenches = []
+    for grip in (before, after):
+        held = MovingHand(grip)
+        held.context.SetTime(0.11)
+        held.context.get_mutable_numeric_parameter(0).SetFromVector(path)
+        held.hand.GetInputPort("pose_master").FixValue(held.context, np.array(pose))
+        held.hand.GetInputPort("twist_master").FixValue(held.context, 0.5 * twist)
+        if grip == after:
+            held.hand.KeepWrench(held.context, GRIP_IMPEDANCES[before], GRIP_IMPEDANCES[after])
+        wrenches.append(held.hand.GetOutputPort("hand_wrench_E").Eval(held.context).copy())
+    assert np.abs(wrenches[0]).min() > 1e-3
+    np.testing.assert_allclose(wrenches[1], wrenches[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.09, 0.12, 0.2, 0.4])

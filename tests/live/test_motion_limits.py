@@ -106,6 +106,18 @@ def test_rate_ends_one_second_after_its_last_repetition():
     assert steering.advance_inputs(inputs, 5e-3, 0.1).x == INPUT_RANGES["x"][1]
 
 
+def test_reversed_rate_leaves_the_end_of_the_range_at_once():
+    steering, end = RateInputs(), INPUT_RANGES["x"][1]
+    inputs = steering.set_rates({"x": 1e5}, Inputs(), 0.0)
+    for k in range(100):
+        inputs = steering.advance_inputs(inputs, 5e-3, 5e-3 * k)
+    assert inputs.x == end
+    inputs = steering.set_rates({"x": -1e4}, inputs, 0.5)
+    for k in range(10):
+        inputs = steering.advance_inputs(inputs, 5e-3, 0.5 + 5e-3 * k)
+    assert end - 800 < inputs.x < end - 500  # 10 slices of 50, and the lead
+
+
 def test_a_target_that_is_set_ends_a_rate(scenario, load):
     live = Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, 0.0)

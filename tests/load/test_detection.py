@@ -273,10 +273,20 @@ def test_weak_force_keeps_a_contact_for_any_hold():
         assert flags[100:1500].all() and not flags[1500 + 64 + hold :].any()
 
 
-def test_long_contact_ends_at_once_and_the_next_is_detected():
+def test_correlated_rest_after_a_contact_is_no_new_contact():
+    """The first innovation after the end of the contact has a predecessor: 0.46, not 2."""
+    contact = np.zeros((400, 6))
+    contact[100:200, 2], contact[200:, 2] = 30.0 * NOISE[2], 2.0 * NOISE[2]
+    flags = ContactDetector(white(0.9), 0.5, hold=20).detect(contact, *at_rest(400))
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(flags)), [99, 219])
+
+
+@pytest.mark.parametrize("following", [0.0, 1e-3])
+def test_long_contact_ends_at_once_and_the_next_is_detected(following):
     contact = np.zeros((20_000, 6))
     contact[100:15_000, 0] = contact[15_100:, 0] = 30.0 * NOISE[0]
-    flags = ContactDetector(white(), 8.0, hold=20).detect(contact, *at_rest(len(contact)))
+    detector = ContactDetector(white(), 8.0, hold=20, following=following)
+    flags = detector.detect(contact, *at_rest(len(contact)))
     np.testing.assert_array_equal(np.flatnonzero(np.diff(flags)), [99, 15_019, 15_099])
 
 

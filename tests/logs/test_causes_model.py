@@ -10,13 +10,18 @@ from posed_record import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs import explained_log
+from drake_teleop.logs.causes.candidates import Candidate
 from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
     Instants,
     block_means_of_record,
     delay_of_free_fit,
 )
-from drake_teleop.logs.causes.intervals import widening_factor_by_misfit
+from drake_teleop.logs.causes.intervals import (
+    _variances_of_rejected_causes,
+    widening_factor_by_misfit,
+)
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
 from drake_teleop.logs.causes.state import (
     UsedRows,
@@ -215,7 +220,58 @@ def test_instants_are_block_means(size):
     )
     called = block_means_of_record(t, noise, moving, GRAVITY_W, lost)
     np.testing.assert_allclose(called.y, data.y, atol=2e-3 * np.abs(data.y).max())
+    fast = moving(8.0 * t), lambda t: moving(8.0 * t)
+    means, called = (block_means_of_record(t, noise, motion, GRAVITY_W).y for motion in fast)
+    assert np.abs(called - means).max() < 1e-3 * np.abs(means).max()
     assert data.dt == pytest.approx(0.02) and data.has_positions
+
+
+@pytest.mark.parametrize(("size", "enough"), [(0.0, False), (0.5, True)])
+def test_acceleration_of_the_origin_is_compared_with_its_noise(size, enough):
+    """The specific force varies with the orientation, although the origin does not accelerate."""
+    s, omega, alpha, R_WS, _ = moving(T)
+    a = size * np.sin(3.0 * T[:, None] + np.arange(3))
+    s = np.einsum("nji,nj->ni", R_WS, a - GRAVITY_W)
+    motion = s, omega, alpha, R_WS
+    data = block_means_of_record(T, np.zeros((len(T), 6)), motion, GRAVITY_W, None, 0.05)
+    assert data.accelerates_enough is enough
+
+
+def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():
+    def fit(shift: float, residual_ratio: float) -> SimpleNamespace:
+        return SimpleNamespace(
+            x=np.full(17, shift), covariance=4.0 * np.eye(17), residual_ratio=residual_ratio
+        )
+
+    for score, ratio, share in (
+        (5.0, 1.0, 0.0),
+        (7.5, 1.0, 0.5),
+        (40.0, 1.0, 1.0),
+        (0.0, 0.4, 1.0),
+    ):
+        rejected = [Candidate("drift", fit(3.0, ratio), score)]
+        found = _variances_of_rejected_causes(fit(0.0, 1.0), rejected)
+        np.testing.assert_allclose(found, share * (3.0**2 + 4.0))
+
+
+@pytest.mark.parametrize("longer", [5.0, 0.0])
+def test_samples_near_the_ends_of_wrench_and_poses_are_not_used(monkeypatch, longer):
+    """Knots are 0.2 s apart; the poses are longer than the wrench, or as long."""
+    monkeypatch.setattr(explained_log, "_noise_of_spline_acceleration", lambda splines: 0.0)
+    splines = SimpleNamespace(
+        quaternion=lambda t: Rotation.from_matrix(moving(t)[3]).as_quat(scalar_first=True),
+        position=lambda t: moving(t)[4],
+        motion=lambda t, gravity: moving(t)[:3],
+        poses=SimpleNamespace(t=np.array([T[0] - longer, T[-1] + longer])),
+        spacing=0.2,
+    )
+    posed = SimpleNamespace(gravity_W=GRAVITY_W, poses=SimpleNamespace(position=np.zeros((2, 3))))
+    log = SimpleNamespace(t=T, wrench=np.zeros((len(T), 6)), bridged=None, posed=posed)
+    data = explained_log._spline_instants(log, SimpleNamespace(splines=splines), 0.1)
+    late = 0.0 if longer else 0.1
+    kept = (T[0] + 0.4 <= T) & (T[-1] - 0.4 - late >= T)
+    differs = np.flatnonzero(data.used != kept)
+    assert len(differs) <= 2 and data.used.sum() > 200  # rounding at the borders
 
 
 def test_rows_within_spans_are_marked():

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.logs.causes.cause import Cause
-from drake_teleop.logs.explained_log import add_description_lines
+from drake_teleop.logs.explained_log import _correct_units, add_description_lines
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 
@@ -277,6 +277,26 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     path = record.write(tmp_path)
     follow(path, add_description_lines(causes, read_log(path), by_pose=True))
     assert read_log(path).wrench == pytest.approx(right, rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "factor", "name", "value"),
+    [
+        ("N", "N m", 1e3, "wrench.torque.unit", "N mm"),
+        ("N", "N m", 4.4482216, "wrench.force.unit", "lbf"),
+        ("lbf", "N m", 1 / 4.4482216, "wrench.force.unit", "N"),
+        ("N", "N mm", 1e-3, "wrench.torque.unit", "N m"),
+        ("N", "N m", 3.0, "wrench.torque.scale", [2 / 3] * 3),
+    ],
+)
+def test_unit_of_force_or_torque_follows_from_the_factor(force, torque, factor, name, value):
+    fields = {"wrench.force.unit": force, "wrench.torque.unit": torque}
+    fields |= {"wrench.force.scale": np.ones(3), "wrench.torque.scale": np.full(3, 2.0)}
+    expected = fields | {name: value}
+    _correct_units(fields, {"factor": factor})
+    assert fields.keys() == expected.keys()
+    for key in fields:
+        assert fields[key] == pytest.approx(expected[key])
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -26,6 +26,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
     find_hypothesis,
     find_offset_step,
 )
+from drake_teleop.logs.dataset.shared_load import find_shared_load
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.sample import TRUE_PHI, WRENCH_NOISE_STD, SampleEpisode, sample_episode
@@ -52,6 +53,18 @@ def verdict(x: SampleEpisode) -> set[str]:
     names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(residual, found.spread)
     return names | ({"tared"} if step is not None else set())
+
+
+def test_shared_load_is_uncertain_by_its_noise_and_the_level_has_its_own_threshold() -> None:
+    found = find_shared_load([log_of(sample_episode(seed)) for seed in range(3)], None)
+    load, floor = found.identification, found.noise_floor
+    np.testing.assert_allclose(
+        load.standard_deviations[:6], load.residual_rms / np.sqrt(load.samples), rtol=1e-6
+    )
+    assert found.threshold == pytest.approx(max(6.2, 1.1 * floor.free_maxima[0]))
+    assert floor.free_maxima[0] < 0.9 * floor.free_maxima.max()
+    error = found.phi[0] - TRUE_PHI[0]
+    assert abs(error) < 5.0 * load.standard_deviations[6] + 0.01 * TRUE_PHI[0]
 
 
 def mapped(M: Any, force: float = 1.0, torque: float = 1.0) -> Callable[..., SampleEpisode]:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from known_motion import motion_at
@@ -97,6 +99,15 @@ def test_undelayed_shifts_motion_but_not_wrench() -> None:
     np.testing.assert_allclose(back.specific_force, now.specific_force, atol=1e-3)
     np.testing.assert_allclose(back.angular_velocity, now.omega, atol=1e-3)
     np.testing.assert_allclose(back.angular_acceleration, now.alpha, atol=1e-2)
+
+
+def test_gaps_of_wrench_and_motion_are_both_flagged_after_a_delay() -> None:
+    log = make_log(np.arange(0, 2, 0.001))
+    flags = np.arange(len(log)) == 500
+    back = remove_delay(replace(log, bridged=flags), 0.0123)
+    np.testing.assert_array_equal(np.flatnonzero(back.bridged), [487, 488, 500])
+    ahead = remove_delay(replace(log, bridged=flags), -0.0123)
+    np.testing.assert_array_equal(ahead.t[ahead.bridged], log.t[[500, 512, 513]])
 
 
 def test_uniform_times_removes_only_jitter() -> None:

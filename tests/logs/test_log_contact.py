@@ -23,14 +23,16 @@ def noise_of(seed: int, n: int = 6000) -> np.ndarray:
     return STD * np.random.default_rng(seed).normal(size=(n, 6))
 
 
-def detect(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) -> Detection:
+def detect(
+    contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None, free_dt: float = DT
+) -> Detection:
     """Return the detection for a contact wrench of a sensor at rest."""
 
     def samples_at_rest(wrench: np.ndarray) -> DetectorSamples:
         still, up = np.zeros((len(wrench), 3)), np.tile([0.0, 0.0, 9.81], (len(wrench), 1))
         return DetectorSamples(wrench, up, still, still, still)
 
-    calm = None if free is None else (samples_at_rest(free), dt)
+    calm = None if free is None else (samples_at_rest(free), free_dt)
     found = detect_contact(samples_at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
     assert found is not None
     return found
@@ -42,6 +44,14 @@ def test_noise_floor_excludes_contact() -> None:
     contact[3500:] += 5.0 + 3 * np.sin(np.linspace(0, 9, 2500))[:, None]
     np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
     assert (noise_floor(np.zeros((100, 6))) == np.repeat([1e-3, 1e-4], 3)).all()
+
+
+def test_log_of_free_motion_may_have_another_rate() -> None:
+    free_dt = 0.5 * DT
+    found = detect(noise_of(1, 1000), free=noise_of(2, 2000), free_dt=free_dt)
+    assert found.noise_floor.fade == pytest.approx(np.exp(-free_dt * CUTOFF))
+    judged = 2000 - 2 * round(1.0 / (CUTOFF * free_dt))
+    assert found.free_duration_s == pytest.approx(judged * free_dt)
 
 
 def test_contacts_have_their_times_and_peaks() -> None:

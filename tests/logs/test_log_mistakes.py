@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,17 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.imu_checks import (
+    _correct_imu_clock,
+    check_imu_against_pose,
+    check_imu_signals,
+)
+from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.check.pose_checks import position_findings
 from drake_teleop.logs.processing import check_log, identify_log
-from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS
+from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS, Log
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.tables import Table
 
 Columns = dict[str, np.ndarray]
 IMU, POSE, BOTH = ("imu",), ("pose",), ("imu", "pose")
@@ -110,6 +121,117 @@ def _repeated_column(c: Columns) -> None:
 
 ABOUT_Z = Rotation.from_euler("z", 45, degrees=True).as_matrix()
 TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
+
+
+def described_imu(**changed: dict[str, Any]) -> Description:
+    """Return a description with columns such as "force_x", and other fields of signals."""
+    document: dict[str, Any] = {
+        stream: {"file": "log.csv", "time": {"column": "t"}}
+        | {
+            name: {"columns": [f"{name}_{axis}" for axis in "xyz"]} | changed.get(name, {})
+            for name in FIELDS[stream]
+        }
+        for stream in ("wrench", "imu")
+    }
+    return Description.model_validate(document)
+
+
+def test_axes_of_the_gyroscope_in_another_order_are_named() -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    at = motion_at(t)
+    omega, alpha = at.omega[:, [1, 2, 0]], at.alpha[:, [1, 2, 0]]
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, omega, alpha)
+    (finding,), corrected = check_imu_signals(described_imu(), log)
+    assert finding.name == "swapped axes" and corrected.imu is not None
+    ordered = [f"angular_velocity_{axis}" for axis in "zxy"]
+    assert finding.message.endswith(f"set imu.angular_velocity.columns: {ordered}")
+    assert [*corrected.imu.angular_velocity.columns] == ordered
+
+
+@pytest.mark.parametrize(
+    ("omega", "alpha", "unit", "line"),
+    [
+        (1.0, 57.3, "rad/s^2", "set imu.angular_acceleration.unit: deg/s^2"),
+        (1.0, 1 / 57.3, "deg/s^2", "set imu.angular_acceleration.unit: rad/s^2"),
+        (57.3, 1.0, "rad/s^2", "set imu.angular_velocity.unit: deg/s"),
+    ],
+)
+def test_unit_of_the_wrong_rate_is_named(omega: float, alpha: float, unit: str, line: str) -> None:
+    t = np.arange(0.0, 4.0, 0.01)
+    at = motion_at(t)
+    log = Log(t, np.zeros((len(t), 6)), at.specific_force, omega * at.omega, alpha * at.alpha)
+    description = described_imu(angular_acceleration={"unit": unit})
+    (finding,), corrected = check_imu_signals(description, log)
+    assert finding.name == "degrees" and finding.message.endswith(line)
+    assert corrected != description
+
+
+def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description, LogData]:
+    """Return a log of 12 s with an IMU in S, a description of its frame, and other columns."""
+    t = np.arange(0.0, 12.0, 0.01)
+    at = motion_at(t)
+    columns = {
+        "t": t,
+        "force": at.specific_force,
+        "torque": at.omega,
+        "specific_force": at.specific_force,
+        "angular_velocity": at.omega,
+        "orientation": quaternions_from_matrices(at.R_WS),
+        "position": at.p_WS,
+    } | changed
+    stream = {"file": "log", "time": {"column": "t"}}
+    wrench, imu, pose = (
+        stream | {name: {"columns": [name]} for name in FIELDS[kind] if name in columns}
+        for kind in FIELDS
+    )
+    pose["orientation"]["form"] = "quaternion_wxyz"
+    imu["frame"] = frame.tolist()
+    document = {"gravity": GRAVITY_W.tolist(), "wrench": wrench, "imu": imu, "pose": pose}
+    description = Description.model_validate(document)
+    return description, LogData(description, "log.yaml", {Path("log"): Table(Path("log"), columns)})
+
+
+def test_mounting_in_the_description_is_corrected_from_the_left() -> None:
+    at = motion_at(np.arange(0.0, 12.0, 0.01))
+    R_SI = Rotation.from_euler("xyz", [30.0, 40.0, -70.0], degrees=True)
+    given = np.round(Rotation.from_euler("z", 90.0, degrees=True).as_matrix())
+    s, omega = (R_SI.apply(x, inverse=True) for x in (at.specific_force, at.omega))
+    description, data = imu_and_pose(given, specific_force=s, angular_velocity=omega)
+    (finding,), _, corrected = check_imu_against_pose(description, data)
+    assert finding.name == "mounting" and corrected.imu is not None
+    np.testing.assert_allclose(corrected.imu.frame, R_SI.as_matrix(), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("scale", "name", "line"),
+    [
+        (1.1, "pose frame", "set pose.position_in_sensor: ["),
+        (1e3, "units", "set pose.position.unit: mm"),
+    ],
+)
+def test_position_of_another_point_or_unit_is_named(scale: float, name: str, line: str) -> None:
+    """Positions of the tool's centre point, with a gain error of 10 % or in mm."""
+    at, rng = motion_at(np.arange(0.0, 12.0, 0.01)), np.random.default_rng(1)
+    place = np.array([0.03, -0.02, 0.15])
+    position = scale * (at.p_WS + at.R_WS @ place + 1e-4 * rng.normal(size=at.p_WS.shape))
+    (finding,) = position_findings(*imu_and_pose(np.eye(3), position=position), 0.0)
+    assert finding.name == name and line in finding.message
+    if name == "pose frame":
+        found = yaml.safe_load(re.findall(r"position_in_sensor: (\[.*?\])", finding.message)[0])
+        np.testing.assert_allclose(found, place, atol=1e-3)
+
+
+def test_lag_of_a_drifting_clock_is_given_at_the_first_row() -> None:
+    drifting = SimpleNamespace(
+        mid_record_lag_s=0.3, clock_drift=2e-3, mid_record_time_s=50.0, lag_s=0.31
+    )
+    data = SimpleNamespace(correct_clock_drift=lambda *given: (given[2], "both", given))
+    description = SimpleNamespace(imu="an IMU")
+    finding, (stream, _, _, drift) = _correct_imu_clock(description, drifting, data)
+    assert (stream, drift) == ("imu", 2e-3)
+    assert "by 0.200 s at its first row and by 2 ms more each second (0.310 s" in finding.message
+
+
 MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]] = [
     ("N mm", _times("torque", 1e3), IMU, "torque factor", "wrench.torque.unit: N mm"),
     ("lbf in", _times("torque", 8.851), POSE, "torque factor", "wrench.torque.unit: lbf in"),

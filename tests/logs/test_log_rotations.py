@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.rotations import NUM_COLUMNS_OF_ROTATION_FORM, rotation_matrices
+from drake_teleop.common.rotations import (
+    NUM_COLUMNS_OF_ROTATION_FORM,
+    orthogonality_error,
+    rotation_matrices,
+)
 from drake_teleop.logs.read.mounting import nonlinear_least_squares
 from drake_teleop.logs.read.streams import OrientationColumns
 
@@ -72,3 +76,9 @@ def test_orientations_of_selected_rows_in_any_form_are_read(form: str, inverse: 
     for k in range(len(rows)):
         written[k : k + 1] = orientations.quaternions(rows[k : k + 1])
     np.testing.assert_allclose(rotation_matrices(written, "quaternion_wxyz"), wanted, atol=1e-12)
+
+
+def test_a_mirrored_matrix_is_no_rotation() -> None:
+    R = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    errors = orthogonality_error(np.stack([R, R @ np.diag([1.0, 1.0, -1.0]), 1.01 * R]))
+    np.testing.assert_allclose(errors, [0.0, 2.0, 1.01**2 - 1.0], atol=1e-12)

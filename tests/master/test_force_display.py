@@ -86,6 +86,8 @@ def test_force_and_torque_are_limited_separately():
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
     _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE_RAD)
     np.testing.assert_allclose(displayed, [0, 0, 10.0, 0.17, 0.05, 0], rtol=1e-12)
+    _, displayed = display([0, 0, 0, 0.34, 0, 5.15], phantom.HOME_POSTURE_RAD)
+    np.testing.assert_allclose(displayed, [0, 0, 0, 0.034, 0, 0.515], rtol=1e-12)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

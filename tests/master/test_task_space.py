@@ -197,6 +197,14 @@ def test_encoders_count_whole_steps_from_the_start():
     np.testing.assert_allclose(pose, omega.forward_kinematics(Q + V), atol=1e-12)
 
 
+@pytest.mark.parametrize("model", FIGURES)
+def test_device_without_dry_friction_has_no_encoder_steps(model):
+    master = Master(model=model).without_coulomb_friction()
+    assert not master.encoder_steps().any()
+    assert not master.device(0.0, 0.0).parameters.dry_friction.any()
+    assert master.device(0.0, 0.0).parameters.damping.all()
+
+
 def test_slow_device_holds_reading_and_force_at_its_rate():
     """Command and force are held for 2 ms, but not the pose of the hand."""
     slow = dataclasses.replace(FIGURES["falcon"], rate_hz=500.0)

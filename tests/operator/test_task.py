@@ -9,6 +9,7 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_normal
 from drake_teleop.lab.identification import true_load
+from drake_teleop.station import master_side
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import JointFriction
@@ -29,6 +30,7 @@ from drake_teleop.station.operator.perception import (
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_distance
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 from drake_teleop.station.task_measures import contact_force, detection_delay, task_measures
 
@@ -329,3 +331,23 @@ def test_target_beyond_its_radius_is_accepted():
 def test_measures_need_a_task(reach):
     with pytest.raises(DrakeTeleopError, match=r"operator\.task"):
         task_measures(reach[0], Scenario())
+
+
+def test_training_contains_scales_and_delays_of_the_station(monkeypatch):
+    monkeypatch.setattr(master_side, "Operator", lambda *given: given)
+    scenario = replace(
+        LoadScenario("touch"),
+        channel=Channel(delay=0.02, backward=NetworkConfig(delay=0.05)),
+        kinematic_scaling__translation_scale=2.0,
+        kinematic_scaling__alignment=[0.1, -0.2, 0.3],
+        force_scaling__gamma=0.5,
+        force_scaling__force_scale=0.1,
+        simulation__seed=7,
+    )
+    _, _, training, _, tip = master_side._make_operator(scenario, np.eye(7)[0])
+    assert (training.translation_scale, training.force_gain, training.seed) == (2.0, 0.05, 7)
+    assert (training.forward_delay_s, training.backward_delay_s) == (0.02, 0.05)
+    R_WB = RollPitchYaw(0.1, -0.2, 0.3).ToRotationMatrix().matrix()
+    np.testing.assert_allclose(training.R_WB, R_WB)
+    slave = NominalSlave(scenario.slave)
+    np.testing.assert_array_equal(tip, [*slave.tip, *slave.start_tip])

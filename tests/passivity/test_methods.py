@@ -19,6 +19,7 @@ from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
+    DISSIPATED_ENERGY,
     LAST_WRENCH,
     MEMORY_SIZE,
     MOTION_SCALE,
@@ -42,7 +43,9 @@ from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
     PACKET_NUMBER,
     PACKET_SIZE,
+    POSE,
     SENDER_INPUTS_FINITE,
+    VELOCITY,
     WRENCH,
     move_pose_into,
     pose_difference_into,
@@ -123,7 +126,7 @@ def line(rng: np.random.Generator, steps: int, delay: int = 20, jitter: int = 20
 def test_outputs_are_finite_limited_and_numbered(method):
     rng = np.random.default_rng(1)
     config = PassivityConfig(method=method, force_limit=2.0, torque_limit=0.04)
-    f_e = wrenches(rng, 1500)
+    f_e = wrenches(rng, 1500) * np.repeat([1.0, 10.0], 3)  # the torque reaches its limit, too
     wrench, command, sent, *_ = run(
         method, config, poses(rng, 1500), poses(rng, 1500), f_e, line(rng, 1500)
     )
@@ -324,16 +327,37 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
 
 def test_tank_with_fastest_sending_is_not_overdrawn():
     """The sent energy is 1000 times its content in a second, each millisecond and each 10 ms."""
-    p = method_parameters(
-        PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0))
-    )
+    config = TwoLayerConfig(send_rate=1000.0)
+    p = method_parameters(PassivityConfig(method="two_layer", two_layer=config))
     for step in (T, 10 * T):
         memory, packet = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
         full = memory[STORED_ENERGY].copy()
         assert np.all(full > 0.0)
         _exchange_tank_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
-        assert np.all(memory[STORED_ENERGY] >= 0.0)
+        reserve = 0.01 * np.array(config.capacity)
+        np.testing.assert_allclose(memory[STORED_ENERGY], reserve, rtol=1e-9)
         np.testing.assert_allclose(memory[STORED_ENERGY] + memory[SENT_ENERGY], full, rtol=1e-12)
+
+
+def test_command_of_the_tank_method_has_the_received_twist():
+    m, p = step_addresses("two_layer"), method_parameters(PassivityConfig(method="two_layer"))
+    memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+    command, packet, zero = np.zeros(13), np.zeros(PACKET_SIZE), np.zeros(6)
+    twist = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])
+    received[POSE], received[VELOCITY], received[SENDER_INPUTS_FINITE] = START, twist, 1.0
+    slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)
+    np.testing.assert_array_equal(command[7:], twist)
+
+
+def test_full_tank_discards_the_rest():
+    config = TwoLayerConfig(send_rate=0.0)
+    p = method_parameters(PassivityConfig(method="two_layer", two_layer=config))
+    memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+    received[CUMULATIVE_ENERGY] = 0.1
+    _exchange_tank_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    np.testing.assert_allclose(memory[STORED_ENERGY], config.capacity)
+    lost = np.add(config.initial, 0.1) - config.capacity
+    np.testing.assert_allclose(memory[DISSIPATED_ENERGY], lost)
 
 
 def test_overdrawn_tank_keeps_its_deficit():

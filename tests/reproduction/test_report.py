@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_teleop.common.style import Picture
+from drake_teleop.lab.reproduction.experiments import (
+    identification_values,
+    raw_force_beyond_free_range,
+    true_parameters,
+)
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     compare_with_paper,
@@ -16,6 +22,7 @@ from drake_teleop.lab.reproduction.report import (
     parameter_rows,
     write_report,
 )
+from drake_teleop.station.scenario import LoadScenario
 
 SUMMARY = {
     "free_force.peak_raw_N": 99.4,
@@ -150,3 +157,43 @@ def test_page_is_reproducible(tmp_path):
 def test_text_is_escaped(tmp_path):
     page = write(tmp_path, setup={"Scenario": "<script>alert(1)</script>"})
     assert "<script>" not in page
+
+
+def test_errors_of_the_identified_load_are_those_of_its_parameters():
+    """The estimated tool is 1 % too heavy; its centre of mass is 3 and 4 mm off."""
+    scenario = LoadScenario("free_motion_force")
+    truth = true_parameters(scenario)
+    estimate = truth.copy()
+    estimate[6] *= 1.01
+    estimate[7:10] = 1.01 * truth[7:10] + estimate[6] * np.array([3e-3, 0.0, -4e-3])
+    estimate[11] -= 2e-4
+    estimate[:6] += [0.3, 0.0, 0.4, 0.0, -0.05, 0.12]
+    load = SimpleNamespace(
+        estimate=estimate,
+        batch=SimpleNamespace(standard_deviations=np.full(16, 0.01), samples=7),
+        recursive_against_batch=0.0,
+        kappa_w10=5.0,
+        trajectory=SimpleNamespace(period=8.0),
+    )
+    found = identification_values(load, scenario)
+    assert found["mass_error_percent"] == pytest.approx(1.0)
+    assert found["com_error_mm"] == pytest.approx(5.0)
+    assert found["inertia_error_max_g_m2"] == pytest.approx(0.2)
+    assert (found["offset_error_N"], found["offset_error_Nm"]) == pytest.approx((0.5, 0.13))
+    assert found["mass_std_percent"] == pytest.approx(1.0 / estimate[6])
+
+
+def test_raw_force_is_beyond_its_free_range_on_either_side():
+    t = 0.01 * np.arange(10)
+    free = np.outer(np.linspace(-1.0, 1.0, 10), [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    measured = np.zeros((10, 6))
+    measured[4] = [1.5, -2.75, 0.0, 9.0, 9.0, 9.0]
+    run = SimpleNamespace(
+        contact_result=SimpleNamespace(t=t),
+        in_contact=np.arange(10) == 4,
+        measured_wrench=measured,
+        measured_wrench_free=free,
+    )
+    beyond = raw_force_beyond_free_range(run)
+    np.testing.assert_allclose(beyond[:2], [0.5, 0.75])
+    assert beyond[2] < 0.0

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
 import pytest
 import sockets
 from click.testing import CliRunner
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, truth
 
+from drake_teleop.cli.calibrate import calibrate_command, make_progress_table
 from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -248,6 +252,15 @@ def test_longest_part_is_written_after_a_clock_change(
     assert len(pl.read_parquet(tmp_path / recorder.log_file_name)) == 800
 
 
+def test_record_is_as_long_as_its_shortest_stream() -> None:
+    recorder = Recorder((WRENCH, POSE), None, X_FS)
+    for k in range(100):
+        recorder.add(Reading(k, DT * k, np.ones(6), stream=WRENCH))
+        if k < 60:
+            recorder.add(Reading(k, DT * k, np.eye(7)[0], stream=POSE))
+    assert recorder.longest_part_s == pytest.approx(59 * DT)
+
+
 def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     recorder = Recorder((WRENCH, POSE), None, X_FS, two_clocks=True)
     pose, wrench = np.eye(7)[0], np.ones(6)
@@ -260,6 +273,40 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
         recorder.add(Reading(k, 90.0 + DT * k, pose, stream=POSE, arrival=DT * k))
     assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.clock_changes <= 2
+
+
+@pytest.mark.parametrize(("degrees", "known"), [(19.0, False), (21.0, True)])
+def test_variance_of_few_degrees_of_freedom_is_not_sufficient(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, degrees: float, known: bool
+) -> None:
+    widths = np.array([0.5]), np.array([0.9]), np.array([degrees])
+    monkeypatch.setattr(
+        "drake_teleop.robots.calibration.half_widths_over_tolerances", lambda *_: widths
+    )
+    at = evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.parquet")
+    assert at.is_within_tolerance.tolist() == [known]
+
+
+def test_progress_shows_values_and_half_widths_in_their_units() -> None:
+    tolerance = parse_tolerance("mass 0.5 %, com 0.5 mm")
+    found = SimpleNamespace(identification=SimpleNamespace(phi=PHI))
+    half, none = np.array([0.5, 0.4, 0.6, 0.8]), np.zeros(4, bool)
+    at = RecordEvaluation(2.0, found, "", half, half < 1.0, none, (), "")
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(make_progress_table(at, tolerance))
+    text = " ".join(console.export_text().replace("│", "").split())
+    for row in ("mass 1.7 0.00425 0.0085 kg", "com x 10 0.2 0.5 mm", "com z 60 0.4 0.5 mm"):
+        assert row in text
+
+
+def test_a_single_result_within_the_tolerance_is_not_known(tmp_path, monkeypatch) -> None:
+    path, out = tmp_path / "log.parquet", tmp_path / "out"
+    evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", path)
+    monkeypatch.setattr("drake_teleop.cli.calibrate.identify_command", lambda *_, **__: {})
+    monkeypatch.setattr("drake_teleop.robots.calibration.FIRST_RECORD_S", 9.0)
+    summary = calibrate_command(f"replay:{path}", out, until="mass 50 %", quiet=True)
+    assert summary["half_widths_95"]["mass"] < 0.1 and summary["looks"] == 1
+    assert summary["known"] == {"mass": False} and not summary["all_known"]
 
 
 @pytest.mark.long

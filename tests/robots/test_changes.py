@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from test_watch import DT, LOAD, OFFSETS, PHI
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causes.instants import NUM_SIGNALS, SPECIFIC_FORCE_SIGNALS
+from drake_teleop.logs.causes.model import Model, StepChange
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import changes
 from drake_teleop.robots.changes import ChangeMonitor
@@ -174,6 +177,25 @@ def test_monitoring_does_not_change_the_wrenches() -> None:
     for one, other in zip(out, plain, strict=True):
         np.testing.assert_array_equal(one.contact, other.contact)
         assert one.flags == other.flags and one.t == other.t
+
+
+@pytest.mark.parametrize(("rest", "certain"), [((0.0, 5.0), True), ((5.0, 9.0), False)])
+def test_kind_of_a_change_needs_rotations_after_it(
+    rest: tuple[float, float], certain: bool
+) -> None:
+    """The other kind explains the record worse by 25 in the likelihood, or by 15."""
+    t, y = np.arange(0.1, 9.0, 0.02), np.zeros((445, NUM_SIGNALS))
+    moves = ~((t >= rest[0]) & (t <= rest[1]))
+    y[moves, SPECIFIC_FORCE_SIGNALS] = np.sin(3.0 * t[moves, None] + np.arange(3))
+    for other, expected in ((-25.0, certain), (-15.0, False)):
+        state = SimpleNamespace(
+            model=Model(steps=(StepChange("load", 5.0),)),
+            data=SimpleNamespace(t=t, y=y, used=np.ones(len(t), bool)),
+            x=np.zeros(27),
+            likelihood=0.0,
+            refit=lambda model, start, other=other: SimpleNamespace(likelihood=other),
+        )
+        assert changes._is_change_kind_certain(state, 5.0) == expected
 
 
 @pytest.mark.long

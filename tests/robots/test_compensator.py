@@ -187,6 +187,46 @@ def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
 
 
+def test_no_delayed_wrench_is_older_than_a_silence() -> None:
+    compensator = Compensator(load(), DT, wait=3, cutoff_hz=None)
+    for reading in readings(20, touched=5.0):
+        compensator.step(reading, reading.t)
+    for reading in readings(1005, touched=-4.0)[1000:]:
+        out = compensator.step(reading, reading.t)
+        np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
+
+
+class RestartCounter:
+    """Monitor and contact detector that count restarts."""
+
+    def __init__(self) -> None:
+        self.restarts: list[np.ndarray | None] = []
+
+    def restart(self, offsets: np.ndarray | None = None) -> None:
+        self.restarts.append(offsets)
+
+    def reading_flags(self, values: np.ndarray) -> int:
+        return 0
+
+    def contact_flag(self, values: np.ndarray, contact: np.ndarray) -> int:
+        return 0
+
+
+def test_detectors_restart_after_silence_and_tare() -> None:
+    watch, detector, drift = RestartCounter(), RestartCounter(), np.full(6, 0.01)
+    compensator = Compensator(load(), DT, watch=watch, detector=detector)
+    stream = resting(round(TARE_REST_S / DT) + 30, OFFSETS + drift)
+    for counter in (watch, detector):
+        counter.restarts.clear()
+    for reading in stream:
+        t = reading.t + (0.2 if reading.number >= 30 else 0.0)
+        compensator.step(reading._replace(t=t), t)
+    assert (len(watch.restarts), len(detector.restarts)) == (0, 2)  # also at the first reading
+    assert compensator.tare().startswith("done")
+    assert len(detector.restarts) == 3
+    np.testing.assert_allclose(watch.restarts, [OFFSETS + drift])
+
+
 def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     compensator, delay = Compensator(load(), DT), 0.2
     flags = []
@@ -243,6 +283,8 @@ def test_wrong_rate_is_flagged() -> None:
         compensator = Compensator(load(), share * DT)
         flags[share] = [compensator.step(each, each.t).flags for each in readings(300)][-1]
     assert flags == {1.0: 0, 1.2: ReadingFlag.WRONG_RATE}
+    compensator, kept = Compensator(load(), DT), [each for each in readings(600) if each.number % 8]
+    assert not any(compensator.step(each, each.t).flags for each in kept)  # an eighth is lost
 
 
 def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
@@ -262,7 +304,7 @@ def test_delayed_wrenches_are_clipped() -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [("free", "done"), ("short", "fewer than 0.5 s"), ("moving", "the sensor moves"),
-     ("push", "contact, or"),
+     ("push", "contact, or"), ("twist", "contact, or"), ("spin", "the sensor moves"),
      ("wavers", "the wrench varies")],
 )  # fmt: skip
 def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
@@ -276,6 +318,7 @@ def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
     for reading in stream:
         values = reading.values.copy()
         values[2] += {"push": 8.0, "wavers": 0.5 * math.sin(30 * reading.t)}.get(name, 0.0)
+        values[[4, 11]] += {"twist": (0.4, 0.0), "spin": (0.0, 0.05)}.get(name, (0.0, 0.0))
         compensator.step(reading._replace(values=values), reading.t)
     assert reason in compensator.tare()
     moved = drift if name == "free" else np.zeros(6)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -106,6 +107,20 @@ def test_without_a_compiler_the_units_contain_sources(monkeypatch, tmp_path):
             names = set(archive.namelist())
         assert {"modelDescription.xml", "sources/wrench_compensator.c"} <= names
         assert not any(name.endswith(".so") for name in names)
+
+
+@pytest.mark.slow
+def test_parameters_start_with_the_identified_load(units):
+    with zipfile.ZipFile(units / "wrench_compensator_fmi2.fmu") as archive:
+        root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+    parameters = [
+        each for each in root.iter("ScalarVariable") if each.get("causality") == "parameter"
+    ]
+    starts = {each.get("name"): float(each[0].get("start")) for each in parameters}
+    names = ["sigma_weight", "sigma_inertia", "gamma", "m", "mc_x", "mc_y", "mc_z"]
+    assert [*starts][:7] == names and [*starts][-6:-3] == [f"offset_f_{k}" for k in "xyz"]
+    expected = [0.0, 0.0, 1.0, *kernel.LOAD.phi, *kernel.LOAD.offsets]
+    np.testing.assert_allclose([*starts.values()], expected)
 
 
 def test_the_same_load_gives_the_same_bytes(units, tmp_path):

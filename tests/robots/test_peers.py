@@ -26,9 +26,10 @@ from websockets.sync.client import connect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots import rtde
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
-from drake_teleop.robots.netft import NetFtSource, parse_counts_and_rate
+from drake_teleop.robots.netft import NetFtSource, SampleClock, parse_counts_and_rate
 from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import (
@@ -180,6 +181,29 @@ def test_rtde_faults_are_flagged() -> None:
         0,
         9.81,
     ]
+
+
+def test_rate_of_a_robot_is_found_although_a_sample_is_lost(monkeypatch) -> None:
+    rows = [(t, *[0.0] * 15) for t in (0.0, 0.008, 0.01, 0.018, 0.02)]
+    monkeypatch.setattr(rtde, "require_library", lambda *_: None)
+    monkeypatch.setattr(RtdeSource, "_start_reader_process", lambda self: None)
+    monkeypatch.setattr(RtdeSource, "_read_samples", lambda self, timeout_s: rows)
+    assert RtdeSource("rtde://192.0.2.1").dt == 0.002
+    rows = [(0.008 * k, *[0.0] * 15) for k in range(5)]
+    assert RtdeSource("rtde://192.0.2.1").dt == 0.008
+
+
+def test_clock_of_sample_numbers_follows_the_measured_rate() -> None:
+    clock, now, times = SampleClock(1e-3), 5.0, []
+    for number in range(40_000):
+        now += 1.001e-3 if number < 20_000 else 1.003e-3
+        times.append(clock.time_of_sample(number, now))
+    steps = np.diff(times)
+    np.testing.assert_allclose(steps[:999], 1e-3, rtol=1e-9)
+    np.testing.assert_allclose(steps[1100:19_000], 1.001e-3, rtol=1e-9)
+    np.testing.assert_allclose(steps[-100:], 1.003e-3, rtol=1e-9)
+    assert clock.time_of_sample(39_990, now) == pytest.approx(times[39_990], abs=1e-4)  # late
+    assert clock.time_of_sample(40_000, now) == pytest.approx(times[-1] + 1.003e-3, abs=1e-9)
 
 
 def test_ros_2_faults_are_flagged() -> None:

@@ -12,7 +12,12 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import ReadingAssembler, ReadingStreams, pose_from_rpy
+from drake_teleop.robots.assembly import (
+    ReadingAssembler,
+    ReadingStreams,
+    _StreamClockOffset,
+    pose_from_rpy,
+)
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Reading, ReadingFlag
@@ -126,8 +131,16 @@ def test_motion_on_another_clock_is_synchronised() -> None:
     late = ReadingAssembler(
         ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
     )
+    assert [same.lag_s, late.lag_s] == pytest.approx([0.5 * 1.8 / 30.0, 0.5 * 1.8 / 30.0 + 0.01])
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
     np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
+
+
+def test_offset_of_a_slow_clock_increases() -> None:
+    rng, clock = np.random.default_rng(0), _StreamClockOffset()
+    for now in np.arange(0.0, 100.0, 0.01):
+        clock.update(now * (1.0 - 5e-4), now + 0.01 * rng.random())
+    assert clock.offset == pytest.approx(0.05, abs=2e-3)
 
 
 def test_readings_are_stale_without_poses_and_recover() -> None:

@@ -194,6 +194,28 @@ def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:
     assert any(text.endswith("damaged") for text in messages)
 
 
+def test_ignored_sigint_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shell ignores it for a background process."""
+    installed = {signal.SIGINT: signal.SIG_IGN}
+    monkeypatch.setattr(signal, "signal", installed.__setitem__)
+    monkeypatch.setattr(signal, "getsignal", installed.get)
+    install_handlers()
+    assert installed.keys() == {signal.SIGINT, signal.SIGTERM}
+    assert installed[signal.SIGINT] is signal.SIG_IGN
+    installed[signal.SIGINT] = signal.default_int_handler
+    install_handlers()
+    assert installed[signal.SIGINT] is installed[signal.SIGTERM]
+
+
+def test_lines_without_numbers_are_counted_without_empty_lines() -> None:
+    out, into = os.pipe()
+    line = line_of(readings(1)[0])
+    os.write(into, line + b"\n\n \n" + line + b"\n{}\n" + line + b"\n")
+    os.close(into)
+    assert [each.number for each in JsonLineSource(out, DT).read(1.0)] == [0, 1, -1, 3]
+    os.close(out)
+
+
 TABLES = ("x.csv", "x.parquet")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,15 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Reading, ReadingFlag
-from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
+from drake_teleop.robots.watch import (
+    ContactAndLoadMonitor,
+    StreamContactDetector,
+    white_wrench_noise,
+)
 
 DT = 0.002
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -74,9 +80,9 @@ def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> Non
     for push in (0.0, 0.5):
         rows = values.copy()
         rows[1000:1250, 1] += push
-        compensator = Compensator(
-            LOAD, DT, detector=StreamContactDetector(LOAD, free, DT, 30.0, 0.0)
-        )
+        detector = StreamContactDetector(LOAD, free, DT, 30.0, 0.0)
+        assert LOAD.covariance[:6].any() and not detector._settings[0][1][:6].any()
+        compensator = Compensator(LOAD, DT, detector=detector)
         compensator.offsets = tared.copy()
         out = [
             compensator.step(Reading(k, float(t[k]), row), float(t[k]))
@@ -148,3 +154,11 @@ def test_tare_resets_the_watch() -> None:
     assert compensator.tare().startswith("done")
     after = [compensator.step(Reading(k, DT * k, values), DT * k).flags for k in range(300, 400)]
     assert not any(after)
+
+
+def test_noise_of_readings_follows_from_the_filtered_residual() -> None:
+    std = np.array([0.2, 0.3, 0.4, 0.02, 0.03, 0.04])
+    noise = std * np.random.default_rng(0).normal(size=(200_000, 6))
+    for cutoff in (30.0, None):
+        filtered = replace(LOAD, residual_rms=low_pass(noise, DT, cutoff).std(axis=0))
+        np.testing.assert_allclose(white_wrench_noise(filtered, DT, cutoff), std, rtol=0.05)

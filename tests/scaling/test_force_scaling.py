@@ -154,6 +154,34 @@ def test_eta_requires_sigma_0_gamma_1_and_a_gripper(config, arm):
         ForceScaling(config, arm, np.eye(3))
 
 
+@pytest.mark.parametrize(("age", "fault"), [(0.049, 0), (0.051, 1), (-0.049, 0), (-0.051, 1)])
+def test_sample_too_old_or_from_the_future_is_a_fault(arm, age, fault):
+    block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
+    context = block.CreateDefaultContext()
+    context.SetTime(3.0)
+    sample = np.concatenate([np.zeros(16), Q, [3.0 - age]])
+    block.GetInputPort("sample").FixValue(context, sample)
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    assert block.GetOutputPort("fault").Eval(context)[0] == fault
+    assert np.isnan(block.GetOutputPort("wrench_B").Eval(context)).all() == bool(fault)
+
+
+def test_new_change_begins_with_the_present_scales(arm):
+    block = ForceScaling(ForceScalingConfig(sigma=0.0, gamma=1.0), arm, np.eye(3))
+    context = block.CreateDefaultContext()
+    block.GetInputPort("load_estimate").FixValue(context, np.zeros(16))
+    scales = dict(sigma_gripper=0.0, sigma_object=0.0, force_scale=1.0)
+    found = []
+    for time, gamma in ((0.0, 3.0), (0.5, 0.0), (1.0, None), (1.5, None)):
+        context.SetTime(time)
+        if gamma is not None:
+            block.SetScales(context, **scales, gamma=gamma, duration=1.0)
+        sample = np.concatenate([[2.0, 0, 0, 0, 0, 0], np.zeros(10), Q, [time]])
+        block.GetInputPort("sample").FixValue(context, sample)
+        found.append(block.GetOutputPort("scaled_wrench_S").Eval(context)[0])
+    np.testing.assert_allclose(found, [2.0, 4.0, 2.0, 0.0], atol=1e-12)
+
+
 def test_invalid_scales_are_rejected(arm):
     block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
     context = block.CreateDefaultContext()

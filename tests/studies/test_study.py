@@ -23,6 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab import run as runs_of_scenarios
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.studies import study as studies
+from drake_teleop.lab.studies.adaptive import propose_points
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.measures import default_measures, evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, StudyProgress, run_study
@@ -532,6 +533,16 @@ def test_adaptive_design_continues_after_any_stop(tmp_path, searched):
             pass
     assert len(calls) == 80 + 5
     assert parts(tmp_path) == parts(searched[1])
+
+
+def test_proposed_points_are_near_the_optimum_despite_noise_and_failed_points():
+    candidates, places = np.linspace(0, 1, 41)[:, None], np.repeat(np.linspace(0, 1, 9), 4)[:, None]
+    exact = 4.0 * (places[:, 0] - 0.3) ** 2
+    noisy = exact + 0.5 * np.random.default_rng(3).normal(size=36)
+    failed = np.where(places[:, 0] > 0.7, np.nan, exact)
+    for objective in (noisy, failed):
+        found = candidates[propose_points(places, objective, candidates, 3), 0]
+        assert np.abs(found - 0.3).max() < 0.1
 
 
 def test_an_adaptive_design_ends_when_it_has_every_combination(tmp_path):

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace as replace_fields
 
 import numpy as np
 import pytest
 
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.comparison.delayed_contact import leaf_thickness
-from drake_teleop.lab.tuning import search
+from drake_teleop.lab.analysis.one_axis import AxisParameters
+from drake_teleop.lab.comparison.delayed_contact import (
+    _slave_heights_and_rotations,
+    delayed_contact,
+    leaf_thickness,
+)
+from drake_teleop.lab.comparison.one_dof import RunMeasures
+from drake_teleop.lab.tuning import press_trial, search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
+    GammaSearch,
     StationTrial,
     TunedSettings,
     press_depth,
@@ -21,9 +29,16 @@ from drake_teleop.lab.tuning.press_trial import (
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
 from drake_teleop.lab.tuning.stated_set import make_stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.operator.perception import Perception
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.slave.plant import NominalSlave
 
 GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
 
@@ -81,6 +96,33 @@ def test_leaf_of_a_stiffness_has_this_stiffness():
     assert leaf.stiffness == pytest.approx(3000.0)
 
 
+def test_press_reaches_the_leaf_and_the_depth_at_the_masters_scale():
+    scaled = replace(LoadScenario("contact_transition"), kinematic_scaling__translation_scale=2.0)
+    settings = UNEQUAL, PassivityConfig(method="ledger")
+    setup, task = delayed_contact(scaled, *settings, 3000.0, depth=0.01)
+    swing, press, retreat = setup.operator.intent
+    assert press.translation == pytest.approx([0.0, 0.0, -(0.03 / 2.0 + 0.01)])
+    np.testing.assert_allclose(retreat.translation, np.negative(press.translation))
+    settle = setup.simulation.settle
+    assert swing.t_start == pytest.approx(settle + task.swing_start)
+    assert press.t_start == pytest.approx(settle + task.press_start)
+    assert press.t_start + press.duration == pytest.approx(settle + task.press_end)
+    assert task.press_start == pytest.approx(2.3 + 0.07)
+    leaf, tip = setup.first_sheet_spring, NominalSlave(scaled.slave).start_tip
+    np.testing.assert_allclose(leaf.position, tip - [0.0, 0.0, 0.03])
+    assert leaf.stiffness == pytest.approx(3000.0)
+
+
+def test_rotation_of_the_slave_is_about_the_axes_of_the_world():
+    scenario, t = LoadScenario("contact_transition"), np.arange(3) * 1e-3
+    state = np.tile([0.1, -0.4, 0.9, 0.2, 0.7, -0.3, *np.zeros(6)], (3, 1))
+    state[1:, 0] += [0.1, -0.2]  # about z_W
+    result = SimulationResult(t, {"slave_state": state}, [SIGNALS["slave_state"]])
+    heights, rotations = _slave_heights_and_rotations(result, scenario)
+    np.testing.assert_allclose(rotations, np.outer([0.0, 0.1, -0.2], [0, 0, 1]), atol=1e-12)
+    assert np.ptp(heights) < 1e-12
+
+
 def test_firm_grip_presses_less_deeply_with_a_weak_device():
     strong = LoadScenario("touch")
     weak = replace(strong, master=Master(model="geomagic_touch"))
@@ -129,9 +171,11 @@ class FakeStation:
         self, limit: float, one_axis_limit: float, noise=1e-3, soft_wall_limit: float = np.inf
     ) -> None:
         self.limit, self.one_axis_limit, self.runs = limit, one_axis_limit, {}
+        self.works: dict[str, object] = {}
         self.noise, self.soft_wall_limit = noise, soft_wall_limit
 
     def __call__(self, name, study, work):
+        self.works[name] = work
         rows = [dict(point) for point in study.points()]
         for row in rows:
             if name == "search":
@@ -148,12 +192,97 @@ class FakeStation:
         return rows
 
 
-def trial(walls=(0.5, 20.0)) -> StationTrial:
+def trial(walls=(0.5, 20.0), task: str = "press") -> StationTrial:
     given = LoadScenario("contact_transition")
     base = without_task_and_method(given, "internet")
-    return StationTrial(
-        given, base, make_stated_set(["light", "firm"], walls, "press"), np.ones(16)
-    )
+    return StationTrial(given, base, make_stated_set(["light", "firm"], walls, task), np.ones(16))
+
+
+@pytest.mark.parametrize(("task", "margin", "bands"), [("touch", 1.1, 2), ("insert", 1.5, 3)])
+def test_noise_and_a_force_of_1_n_bound_the_tried_gammas(task, margin, bands):
+    """Noise of 0.03 N is accepted up to a gamma of 1.67; a narrower band has less noise."""
+    for noise, highest in ((0.03, np.inf), (1e-6, 17.5 * margin)):
+        station = FakeStation(limit=np.inf, one_axis_limit=2.2, noise=noise)
+        heavy = replace_fields(trial(task=task), load_estimate=np.full(16, 100.0))
+        found = search_settings(heavy, station)
+        bounds = station.works["search"].gamma_upper_bounds
+        expected = {
+            f: min(0.05 / noise * np.sqrt(500.0 / f), highest) for f in (500.0, 100.0, 50.0)
+        }
+        assert bounds == pytest.approx({f: expected[f] for f in [*expected][:bands]})
+        for row in found.searched_settings:
+            if row["method"] == "ledger" and row["low_pass_hz"] == 100.0:
+                gamma = 2.2 / margin
+                swing = (
+                    row["sigma_inertia"] / 17.5 * 100.0 * 0.02 * (3.0 * np.pi) ** 2 / np.sqrt(2.0)
+                )
+                human = Perception()
+                smallest = max(human.absolute_threshold, human.weber_fraction * swing)
+                felt = smallest + 2.0 * noise * np.sqrt(0.2) * gamma
+                assert row["gamma"] == pytest.approx(gamma)
+                assert row["threshold_N"] == pytest.approx(felt * 17.5 / (gamma * 0.95))
+        largest = max(row["gamma"] for row in found.beyond_runs)
+        assert largest == pytest.approx(1.2 * margin * found.settings.gamma)
+
+
+class CapturedArguments(Exception):
+    """Arguments with which a replaced function is called."""
+
+
+def capture_arguments(*arguments, **options):
+    raise CapturedArguments(arguments, options)
+
+
+UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
+
+
+def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
+    monkeypatch.setattr(press_trial, "run_one_dof", capture_arguments)
+    one = trial()
+    search_ = GammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
+    tuned = TunedSettings("ledger", 1.0, 0.3, 100.0)
+    with pytest.raises(CapturedArguments) as found:
+        search_.share_in_one_axis(AxisParameters(), tuned, 1.5, "firm", 3000.0, 4)
+    (model, _, forward, backward), options = found.value.args
+    assert forward.delay == 0.02 and backward.delay == pytest.approx(0.05 + 0.416 / 100.0)
+    assert (model.hand_stiffness, model.wall_stiffness, model.gamma) == (700.0, 3000.0, 1.5)
+    assert options["seed"] == 4
+
+
+def test_trial_waits_for_both_directions_and_presses_as_deep_as_the_device_can(monkeypatch):
+    monkeypatch.setattr(press_trial, "delayed_contact", capture_arguments)
+    one = trial()
+    one = replace_fields(one, base_scenario=replace(one.base_scenario, channel=UNEQUAL))
+    values = {"method": "as given", "hand": "firm", "wall": 3000.0}
+    with pytest.raises(CapturedArguments) as found:
+        one(values, 3)
+    (_, channel, _, wall), options = found.value.args
+    assert (channel, wall, options["depth"]) == (UNEQUAL, 3000.0, 0.02)
+    assert options["task"] == press_trial.short_press_task(0.07)
+
+
+@pytest.mark.parametrize("free_force", [0.0, 4.0])
+def test_smallest_detected_force_is_that_at_the_tool(monkeypatch, free_force):
+    """The operator detects 0.06 N or a tenth of the free force, and twice the force at rest."""
+    t = np.arange(0.0, 8.0, 1e-3)
+    ripple = 0.02 * np.sin(2.0 * np.pi * 40.0 * t)[:, None] * [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    signals = {"force_to_master": ripple, "true_contact_wrench_W": np.full((len(t), 6), -5.0)}
+    measures = RunMeasures(True, 0.0, 0.0, 0.0, 0.0, -0.2, 0.0, free_force, 0.0, 0.0)
+    for name, value in (
+        ("MakeTeleopStation", None),
+        ("simulate", SimulationResult(t, signals, [SIGNALS[name] for name in signals])),
+        ("figures_of_station_run", measures),
+    ):
+        monkeypatch.setattr(press_trial, name, lambda *_, value=value, **__: value)
+    tuned = {"method": "ledger", "gamma": 2.0, "sigma_inertia": 0.3, "low_pass_hz": 100.0}
+    found = trial()(tuned | {"hand": "firm", "wall": 3000.0}, 3)
+    rest = 0.02 / np.sqrt(2.0)
+    human = Perception()
+    smallest = max(human.absolute_threshold, human.weber_fraction * free_force)
+    assert found["share"] == pytest.approx(0.8) and found["contact_N"] == 5.0
+    assert found["rest_force_N"] == pytest.approx(rest, rel=0.02)
+    expected = (smallest + 2.0 * found["rest_force_N"]) / (2.0 / 17.5 * 0.8)
+    assert found["threshold_N"] == pytest.approx(expected)
 
 
 def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():

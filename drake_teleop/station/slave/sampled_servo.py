@@ -37,7 +37,7 @@ def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
     if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
     most = max(int(control_hz / _MIN_SERVO_EVENT_HZ), 1)
-    return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
+    return next(m for m in range(most, 0, -1) if whole % m == 0)
 
 
 @njit(cache=True)
