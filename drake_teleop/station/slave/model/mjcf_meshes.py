@@ -22,6 +22,7 @@ from drake_teleop.station.slave.model.triangles import (
     read_triangles,
 )
 
+
 class MassProperties(NamedTuple):
     """Mass [kg], centre (3,) [m] and inertia (3, 3) about the centre [kg m^2]."""
 
