@@ -44,7 +44,7 @@ from drake_teleop.lab.analysis.period_map import (
     RECEIVED_FORCE,
     SAMPLED_FORCE,
     Sampling,
-    delay_in_hand_periods,
+    one_way_delay_in_hand_periods,
     period_map_of_cut_loop,
     sampled_two_port,
 )
@@ -89,8 +89,8 @@ def simulate(
     force = (axis.tool_mass, estimate, axis.sigma, axis.gamma, axis.force_scale)
     out = np.zeros((round(duration * sampling.hand_hz), 5))
     _simulate(
-        master, slave, servo, force, every, 1 / tick_hz, delay_in_hand_periods(axis, sampling),
-        sections, substeps, start, out,
+        master, slave, servo, force, every, 1 / tick_hz,
+        one_way_delay_in_hand_periods(axis, sampling), sections, substeps, start, out,
     )  # fmt: skip
     return out
 
@@ -240,7 +240,10 @@ def continuous_margin(axis: OneAxis) -> float:
 
 def grows(axis: OneAxis, sampling: Sampling) -> bool:
     """Return whether the closed loop with its registers has an eigenvalue outside |z| = 1."""
-    M, registers = period_map_of_cut_loop(axis, sampling), 2 * delay_in_hand_periods(axis, sampling)
+    M, registers = (
+        period_map_of_cut_loop(axis, sampling),
+        2 * one_way_delay_in_hand_periods(axis, sampling),
+    )
     n = len(M) - 3
     closed = np.diag(np.ones(n + registers - 1), -1)
     closed[: n + 1] = 0.0

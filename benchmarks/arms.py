@@ -45,7 +45,7 @@ from drake_teleop.lab import new_station
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, PHI_COLUMN, ArmModel, pose_into
-from drake_teleop.station.slave.plant import ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import ParseSlave, finalize_without_limit_warnings
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
@@ -244,7 +244,7 @@ def _append(found: Path, values: dict[str, Any]) -> None:
 def _read_package(file: ArmFile) -> tuple[ArmModel, list[str]]:
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, Slave(model=str(file.path), sensor_frame=file.frame, tool=_TOOL))
-    finalize_plant(plant)
+    finalize_without_limit_warnings(plant)
     arm, assumed = parsed.arm()
     pose_into(arm.table, np.zeros(arm.num_joints), np.empty(7))
     return arm, [*parsed.assumptions, *assumed]

@@ -14,7 +14,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.plant import NominalSlave, ParsedSlave, ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import (
+    NominalSlave,
+    ParsedSlave,
+    ParseSlave,
+    finalize_without_limit_warnings,
+)
 from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
@@ -34,7 +39,7 @@ def start_figures(scenario: Scenario, assumed: Sequence[str]) -> dict[str, Any]:
     parsed = ParseSlave(plant, scenario.slave)
     if scenario.surroundings is not None:
         AddEnvironment(plant, scenario.surroundings)
-    finalize_plant(plant)
+    finalize_without_limit_warnings(plant)
     diagram = builder.Build()
     context = plant.GetMyMutableContextFromRoot(diagram.CreateDefaultContext())
     arm, q = parsed.arm()[0], NominalSlave(scenario.slave).start

@@ -35,9 +35,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
 from drake_teleop.robots.calibration import RecordEvaluation, calibrate
 from drake_teleop.robots.recording import Recorder
@@ -92,7 +92,7 @@ def turned(omega: Array, dt: float) -> Array:
 
 def excited(t: Array) -> Motion:
     """Return the motion of `excite` for the station's slave, period after period."""
-    from drake_teleop.lab.excitation.excite import excite, sensor_motion
+    from drake_teleop.lab.excitation.excite import excite, trajectory_sensor_motion
     from drake_teleop.lab.excitation.robot import RobotFromScenario
     from drake_teleop.station.scenario import LoadScenario
 
@@ -101,7 +101,7 @@ def excited(t: Array) -> Motion:
     period = found.trajectory.period
     rows = np.round((t % period) * 1000.0).astype(int)
     s, omega, alpha = (
-        x[np.minimum(rows, len(x) - 1)] for x in sensor_motion(robot, found.trajectory)
+        x[np.minimum(rows, len(x) - 1)] for x in trajectory_sensor_motion(robot, found.trajectory)
     )
     return s, omega, alpha
 
@@ -153,8 +153,9 @@ def judged(at: RecordEvaluation, tolerance: Tolerance, phi: Array) -> dict[str, 
     assert at.identified_log is not None
     found = at.identified_log.identification.phi
     error = np.abs(
-        required_values(tolerance, found) - required_values(tolerance, phi)
-    ) / tolerances_in_units(tolerance, phi)
+        display_values_of_required_entries(tolerance, found)
+        - display_values_of_required_entries(tolerance, phi)
+    ) / tolerances_in_display_units(tolerance, phi)
     return {
         "t": at.record_length_s,
         "error": error.tolist(),

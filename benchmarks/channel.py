@@ -12,7 +12,10 @@ import argparse
 import json
 from pathlib import Path
 
-from drake_teleop.lab.reproduction.speed import MakeMovingStation, cpu_time_per_simulated_second
+from drake_teleop.lab.reproduction.speed import (
+    MakeSettledStationSimulator,
+    cpu_time_per_simulated_second,
+)
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -23,12 +26,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     direct = LoadScenario("free_motion_force")
-    stations = {"direct": MakeMovingStation(direct)}
+    stations = {"direct": MakeSettledStationSimulator(direct)}
     for method in METHODS:
         over = replace(
             direct, channel=Channel(network="internet"), passivity=PassivityConfig(method=method)
         )
-        stations[method] = MakeMovingStation(over)
+        stations[method] = MakeSettledStationSimulator(over)
     cost = cpu_time_per_simulated_second(stations)
     figures = {name: cost[name] / cost["none"] for name in cost}
     print("cost of the whole station over that without a method on the same network")

@@ -40,7 +40,11 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import fit_noise_floor, statistics_of_log
-from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, NoiseFloor, limit_covariance
+from drake_teleop.load.contact.noise_floor import (
+    STATISTIC_NAMES,
+    NoiseFloor,
+    limit_covariance_to_scales,
+)
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -170,7 +174,7 @@ def measure() -> dict[str, Any]:
             calm, elsewhere, untouched, touched = (
                 (rows[0] - mean, *rows[1:]) for rows in (calm, elsewhere, untouched, touched)
             )
-        P = limit_covariance(phi, result.covariance)
+        P = limit_covariance_to_scales(phi, result.covariance)
         if fixed or kind == "raw":
             P = np.zeros((16, 16))
         if fixed:
@@ -223,7 +227,7 @@ def at_equal_rate(gains: Array, lag: int, hours: float) -> dict[str, Any]:
     def rows(samples: int, seed: int, push: Array | None = None) -> tuple[Array, ...]:
         return Record(samples, seed, push, gains, lag).rows("eliminated", phi, offsets)
 
-    floor = fit_noise_floor(*rows(120_000, 2), limit_covariance(phi, result.covariance))
+    floor = fit_noise_floor(*rows(120_000, 2), limit_covariance_to_scales(phi, result.covariance))
     chunks = round(hours * 3600 * SECOND / CHUNK)
     peaks = [
         compared(floor, rows(CHUNK, 100 + k)).reshape(-1, SECOND, 2 + len(SLACKS)).max(axis=1)

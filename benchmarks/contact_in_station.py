@@ -51,7 +51,7 @@ from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import sensor_accelerations
+from drake_teleop.station.slave.arm import accelerations_from_specific_forces
 from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -116,7 +116,9 @@ def sizes(result: SimulationResult, estimate: Array, scenario: Scenario) -> dict
     """Return |f| (N,) by the eliminated part."""
     wrench, s, omega, alpha = sensor_samples(result)
     offsets, phi, rest = estimate[:6], estimate[6:], np.zeros_like(s)
-    gravity = s - sensor_accelerations(slave_arm(scenario), result["joint_position"], s)
+    gravity = s - accelerations_from_specific_forces(
+        slave_arm(scenario), result["joint_position"], s
+    )
     wrenches = {
         "raw": wrench - wrench[0],
         "gravity_only": contact_wrench(wrench, offsets, gravity, rest, rest, phi),
@@ -190,7 +192,7 @@ def free_run(seconds: float, seed: int) -> dict[str, float]:
     flags = result["contact"][:, 0]
     arm = slave_arm(scenario)
     _, s, _, alpha = sensor_samples(result)
-    a = np.linalg.norm(sensor_accelerations(arm, result["joint_position"], s), axis=1)
+    a = np.linalg.norm(accelerations_from_specific_forces(arm, result["joint_position"], s), axis=1)
     return {
         "seconds": seconds,
         "up_s": float(flags.mean() * seconds),

@@ -30,7 +30,7 @@ from drake_teleop.lab.excitation.excite import (
     criterion_values,
     excite,
     find_best_within_limits,
-    sensor_motion,
+    trajectory_sensor_motion,
 )
 from drake_teleop.lab.excitation.optimizer import (
     USABLE_LIMIT_SHARE,
@@ -133,7 +133,7 @@ def errors(robot: Robot, criterion: str, seeds: int) -> list[float]:
     squares = []
     for seed in range(seeds):
         motion = excite(robot, criterion=criterion, seed=seed).trajectory
-        s, omega, alpha = sensor_motion(robot, motion)
+        s, omega, alpha = trajectory_sensor_motion(robot, motion)
         late = round(DELAY * 1e3)
         truth = np.roll(non_contact_wrench(s, omega, alpha, TOOL), late, axis=0)
         rng = np.random.default_rng(seed)

@@ -86,12 +86,12 @@ def station_of(arm: str, models: Path | None) -> Scenario:
     if file:
         slave = dataclasses.replace(slave, model=str(models / file) if models else "")
     scenario, master = LoadScenario("free_motion_force"), Master(model=DEVICES[arm])
-    own_period = master.sampling_period(scenario.rates.hand_hz)
+    own_period = master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
     rate = scenario.rates.hand_hz if own_period is None else 1 / own_period
     return replace(
         scenario,
         slave=slave,
-        master=master.without_coulomb_friction(),
+        master=master.without_coulomb_friction_and_encoder_steps(),
         rates=dataclasses.replace(scenario.rates, hand_hz=rate, joint_control_hz=rate),
         force_scaling__sigma=0.5,
         operator__grip="light",

@@ -31,7 +31,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import INPUTS_FILE, models_dir
+from drake_teleop.common.files import DRIVE_INPUTS_FILE_NAME, models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import Inputs, read_inputs
@@ -303,16 +303,17 @@ def killed(path: Path) -> None:
             for ms in range(10**6):
                 record.write(ms, Inputs(x=ms % 1000))
         os._exit(0)
-    while not (folder / INPUTS_FILE).exists() and not os.waitpid(child, os.WNOHANG)[0]:
+    while not (folder / DRIVE_INPUTS_FILE_NAME).exists() and not os.waitpid(child, os.WNOHANG)[0]:
         time.sleep(1e-4)
     time.sleep(1e-6 * min(abs(microseconds), 30_000))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    text = (folder / INPUTS_FILE).read_text()
+    text = (folder / DRIVE_INPUTS_FILE_NAME).read_text()
     if text.count("\n") < 4:
         return
     changes = read_inputs(
-        folder / INPUTS_FILE, versions_and_file_digest(LoadScenario(folder / "scenario.yaml"))
+        folder / DRIVE_INPUTS_FILE_NAME,
+        versions_and_file_digest(LoadScenario(folder / "scenario.yaml")),
     )
     expected = [(0, 0), *((ms, ms % 1000) for ms in range(1, len(changes)))]
     if [(ms, inputs.x) for ms, inputs in changes] != expected:

@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import ReadingAssembler, ReadingStreams
+from drake_teleop.robots.assembly import ReadingAssembler, WrenchAndMotionStreams
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
 from drake_teleop.robots.ros2_messages import MESSAGE_TYPE_OF_TOPIC
@@ -107,7 +107,7 @@ def netft_wrenches(path: Path) -> None:
             yield Reading(k, DT * k, still, stream=IMU)
             yield source.reading_of_packet(packet, DT * k)
 
-    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH), _Told(IMU))), parts())
+    _checked(ReadingAssembler(WrenchAndMotionStreams(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
@@ -121,7 +121,7 @@ def rtde_wrenches(path: Path) -> None:
     parts = (
         part for each in whole for part in readings_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
     )
-    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH, POSE))), parts)
+    _checked(ReadingAssembler(WrenchAndMotionStreams(_Told(WRENCH, POSE))), parts)
 
 
 _SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPE_OF_TOPIC}
@@ -135,7 +135,7 @@ def ros_wrenches(path: Path) -> None:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
             parts += _MESSAGES.readings_of_cdr(name, message[:-_SENT], message[-_SENT:])
-    _checked(ReadingAssembler(ReadingStreams(_Told(WRENCH, POSE))), iter(parts))
+    _checked(ReadingAssembler(WrenchAndMotionStreams(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:

@@ -24,14 +24,14 @@ from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
     allocate_scratch,
+    discount_samples_and_recentre_prior,
     eliminate_rows,
-    forget_samples,
-    invert_matrix,
     nonzero_regressor_terms,
     residual_products,
-    solve_linear_system,
+    solve_augmented_system_in_place,
     weighted_gram,
     weighted_right_side,
+    write_inverse_6x6,
     write_products_vector,
 )
 from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
@@ -65,7 +65,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
         S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[13 + c, 13 + c]
         for d in range(6):
             S[c, d] /= measured[0, 0] + _NOISE_SAMPLES
-    invert_matrix(S, inverse, W)
+    write_inverse_6x6(S, inverse, W)
     weighted_gram(instruments, W, index, factors, E, MRg, 0)
     weighted_gram(mixed, W, index, factors, E, MRg, 16)
     weighted_right_side(mixed[:, 13:].T, W, index, factors, g)
@@ -99,7 +99,7 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
     y, z = np.empty(19), np.empty(19)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            forget_samples(memory, theta, information, forgetting)
+            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
         wrench = samples[n, SAMPLE_WRENCH]
         write_products_vector(wrench, samples[n, SAMPLE_MOTION], z)
         write_products_vector(wrench, samples[n, INSTRUMENTS], y)
@@ -107,7 +107,7 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         add_outer_product(y, z, memory[19:38])
         add_outer_product(y, y, memory[38:57])
         riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
-        solve_linear_system(A)
+        solve_augmented_system_in_place(A)
         copy_into(theta, 0, A[:, 16], 0, 16)
 
 

@@ -61,7 +61,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
     follow_pose,
     orientation_length,
 )
-from drake_teleop.station.slave.plant import ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import ParseSlave, finalize_without_limit_warnings
 
 Array = Any
 PERIOD = 5e-4
@@ -118,7 +118,7 @@ def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame
     found = {}
     plant = MultibodyPlant(0.0)
     instance = ParseSlave(plant).instance
-    finalize_plant(plant)
+    finalize_without_limit_warnings(plant)
     found["rx90"] = ArmModelFromPlant(plant, instance), plant, plant.GetFrameByName("sensor")
     with tempfile.TemporaryDirectory() as folder:
         files = {}
@@ -137,7 +137,7 @@ def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame
         for name, (path, frame) in files.items():
             plant = MultibodyPlant(0.0)
             model = ParseModel(plant, path, frame)
-            finalize_plant(plant)
+            finalize_without_limit_warnings(plant)
             arm = ArmModelFromPlant(plant, model.instance, frame)
             found[name] = arm, plant, plant.GetFrameByName(frame, model.instance)
     return found

@@ -39,7 +39,11 @@ from numpy.typing import NDArray
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.comparison.compare_passivity import base_scenario
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND
-from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.comparison.station_accounts import (
+    start_energy,
+    station_accounts,
+    work_of_displayed_load_wrench,
+)
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
@@ -304,7 +308,7 @@ def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict
     accounts = station_accounts(result, scenario)
     energy = accounts[:, HAND] + accounts[:, ACTUAL] + start_energy(scenario)
     if scaling.sigma > 0.0:
-        energy += load_work(result, scenario)
+        energy += work_of_displayed_load_wrench(result, scenario)
     at = int(np.searchsorted(t, times.let_go))
     before = contact[at - 20 : at].mean(axis=0)
     out = before / max(float(np.linalg.norm(before)), 1e-9)

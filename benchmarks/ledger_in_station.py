@@ -40,7 +40,11 @@ from drake_teleop.lab.comparison.delayed_contact import (
     figures_of_station_run,
 )
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.comparison.station_accounts import (
+    start_energy,
+    station_accounts,
+    work_of_displayed_load_wrench,
+)
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
@@ -141,7 +145,7 @@ def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Names
     accounts = station_accounts(result, scenario)
     accounts[:, HAND] += start_energy(scenario)
     if sigma > 0.0:
-        accounts[:, HAND] += load_work(result, scenario)
+        accounts[:, HAND] += work_of_displayed_load_wrench(result, scenario)
     inside, at_motors = (accounts[:, HAND] + accounts[:, place] for place in (ACTUAL, MOTOR))
     scale = scenario.force_scaling.force_scale
     rubbed = scale * friction_work(result, scenario)

@@ -43,7 +43,10 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.reproduction.experiments import contact_values, simulate_contact
+from drake_teleop.lab.reproduction.experiments import (
+    detection_and_peaks_of_contact_run,
+    simulate_contact,
+)
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -86,7 +89,7 @@ def detection() -> dict[str, Any]:
     scenario = replace(LoadScenario("contact_transition"), rates__log_hz=2000.0)
     estimate = identified_load(scenario, False).estimate
     run = simulate_contact(scenario, estimate, lambda name: lambda done, words="": None)
-    values, arm = contact_values(run), slave_arm(scenario)
+    values, arm = detection_and_peaks_of_contact_run(run), slave_arm(scenario)
     touched, free = (np.abs(residual(x, arm)) for x in (run.touched, run.free))
     start = run.touched.t[np.argmax(run.contact)]
     beyond = (touched > 1.5 * free.max(axis=0)).any(axis=1) & (run.touched.t >= start)

@@ -43,8 +43,12 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.load.tolerance import parse_tolerance, required_values, tolerances_in_units
-from drake_teleop.logs.processing import identify_log, usable_phi
+from drake_teleop.load.tolerance import (
+    display_values_of_required_entries,
+    parse_tolerance,
+    tolerances_in_display_units,
+)
+from drake_teleop.logs.processing import identify_log, phi_with_inertia_replaced
 from drake_teleop.logs.read.alignment import choose_delay, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
@@ -115,7 +119,7 @@ def ours_at_rest(s: Array, wrench: Array) -> Found:
     """Return the result of `identify` for static poses."""
     still = np.zeros_like(s)
     load = identify_batch(wrench, s, still, still, shared_noise=True).identification
-    return Found(usable_phi(load)[0])
+    return Found(phi_with_inertia_replaced(load)[0])
 
 
 def held_out(log: Log, phi: Array, up: Array | None = None) -> tuple[float, float]:
@@ -157,9 +161,14 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
         }
         at = evaluate_record(path, ASKED, None, cutoff_hz=30.0, delay="auto")
         for name, each in found.items():
-            error = np.abs(required_values(ASKED, each.phi) - required_values(ASKED, phi))
+            error = np.abs(
+                display_values_of_required_entries(ASKED, each.phi)
+                - display_values_of_required_entries(ASKED, phi)
+            )
             relative = (
-                error / tolerances_in_units(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
+                error
+                / tolerances_in_display_units(ASKED, phi)
+                * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
             )
             if name == "ours":
                 false += int(
@@ -345,7 +354,10 @@ def ntnu(records: Path, folder: Path) -> dict[str, Any]:
     )
     theta = np.linalg.lstsq(rows.reshape(-1, 10), wrench.ravel(), rcond=None)[0]
     fit = identify_batch(wrench, -gravity, still, still, shared_noise=True).identification
-    by_peer = {"ours": usable_phi(fit)[0], "kth": np.concatenate([theta[:4], np.zeros(6)])}
+    by_peer = {
+        "ours": phi_with_inertia_replaced(fit)[0],
+        "kth": np.concatenate([theta[:4], np.zeros(6)]),
+    }
     for record in ("1-baseline", "2-vibrations"):
         log = read_log(described(records, record, folder))
         late = remove_delay(log, choose_delay(log, 30.0, "auto", by_peer["ours"])[0])

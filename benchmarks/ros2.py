@@ -36,11 +36,11 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
-from drake_teleop.robots.calibration import half_widths_over_tolerances
+from drake_teleop.robots.calibration import half_widths_and_dof_over_tolerances
 
 Array = NDArray[np.float64]
 
@@ -165,11 +165,14 @@ class Tables:
     def judged(self, found: Identification) -> NDArray[np.bool_]:
         """Return flags (3, k): number within 95 % interval, 99.98 % interval, and tolerance."""
         tolerance = parse_tolerance(UNTIL)
-        half, wide, _ = half_widths_over_tolerances(
+        half, wide, _ = half_widths_and_dof_over_tolerances(
             SimpleNamespace(identification=found), tolerance
         )  # type: ignore[arg-type]
-        error = np.abs(required_values(tolerance, found.phi) - required_values(tolerance, self.phi))
-        error /= tolerances_in_units(tolerance, self.phi)
+        error = np.abs(
+            display_values_of_required_entries(tolerance, found.phi)
+            - display_values_of_required_entries(tolerance, self.phi)
+        )
+        error /= tolerances_in_display_units(tolerance, self.phi)
         return np.array([error <= half, error <= wide, error <= 1.0])
 
 

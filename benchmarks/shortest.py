@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from drake_teleop.lab.excitation.limits import (
-    empty_motions,
+    allocate_link_motions,
     write_link_motions,
     write_sensor_motion,
 )
@@ -31,9 +31,9 @@ from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
@@ -72,7 +72,7 @@ def reached(
     sensor, table, phi = scenario.wrist_sensor, robot.arm.table, robot.limits.heaviest_phi
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(motions), 3))
     write_sensor_motion(motions, vectors)
@@ -84,13 +84,18 @@ def reached(
     )
     samples, within = np.empty((len(truth), 22)), 0
     rng = np.random.default_rng(0)
-    true, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
+    true, sizes = (
+        display_values_of_required_entries(tolerance, phi),
+        tolerances_in_display_units(tolerance, phi),
+    )
     for _ in range(records):
         noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_BLOCK_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())
-        within += int((np.abs(required_values(tolerance, load.phi) - true) <= sizes).all())
+        within += int(
+            (np.abs(display_values_of_required_entries(tolerance, load.phi) - true) <= sizes).all()
+        )
     return within / records
 
 

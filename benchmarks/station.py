@@ -26,8 +26,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_teleop.lab.reproduction.speed import (
-    MakeBarePlant,
-    MakeMovingStation,
+    MakeBarePlantSimulator,
+    MakeSettledStationSimulator,
     cpu_time_per_simulated_second,
 )
 from drake_teleop.station.channel.channel import Channel
@@ -100,8 +100,10 @@ def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]
         "free_motion_joint_control_10_khz": joint_control_10_khz(free),
         "contact_joint_control_10_khz": joint_control_10_khz(contact),
     }
-    makes = {name: partial(MakeMovingStation, s) for name, s in scenarios.items()}
-    whole = fastest(makes | {"bare": partial(MakeBarePlant, free)}, contact.simulation.duration)
+    makes = {name: partial(MakeSettledStationSimulator, s) for name, s in scenarios.items()}
+    whole = fastest(
+        makes | {"bare": partial(MakeBarePlantSimulator, free)}, contact.simulation.duration
+    )
     figures = {"bare_us_per_step": whole["bare"] / free.rates.sensor_hz * 1e6}
     for name in scenarios:
         figures[f"{name}_over_bare"] = whole[name] / whole["bare"]
@@ -120,7 +122,7 @@ def ledger_over_none(free: Scenario, contact: Scenario) -> dict[str, float]:
     for name, scenario in (("free_motion", free), ("pressed_softly", soft)):
         makes = {
             method: partial(
-                MakeMovingStation,
+                MakeSettledStationSimulator,
                 replace(
                     scenario,
                     channel=Channel(network="lan"),
@@ -160,7 +162,7 @@ def rates(free: Scenario) -> dict[str, float]:
         "1_khz": replace(free, rates__sensor_hz=1000.0, wrist_sensor__bandwidth_hz=400.0),
     }
     cost = cpu_time_per_simulated_second(
-        {name: MakeMovingStation(s) for name, s in sensors.items()}
+        {name: MakeSettledStationSimulator(s) for name, s in sensors.items()}
     )
     return {f"real_time_factor_sensor_{name}": 1 / seconds for name, seconds in cost.items()}
 
@@ -176,7 +178,7 @@ def two_processes() -> float:
 
 
 def _run_alone(seconds: float) -> float:
-    simulator = MakeMovingStation(LoadScenario("free_motion_force"))
+    simulator = MakeSettledStationSimulator(LoadScenario("free_motion_force"))
     start = time.perf_counter()
     advance_without_garbage_collection(simulator, simulator.get_context().get_time() + seconds)
     return time.perf_counter() - start
@@ -185,7 +187,7 @@ def _run_alone(seconds: float) -> float:
 def against_the_port(scenario: Scenario) -> float:
     """Return the largest difference of the ideal sensor's force from the plant's reaction port."""
     scenario = replace(scenario, wrist_sensor__ideal=True)
-    simulator = MakeMovingStation(scenario)
+    simulator = MakeSettledStationSimulator(scenario)
     station, context = simulator.get_system(), simulator.get_context()
     plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
     # The load on the body that carries S; each part has a weld.

@@ -32,7 +32,7 @@ from station import against_the_port, fastest
 
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation
+from drake_teleop.lab.reproduction.speed import MakeBarePlantSimulator, MakeSettledStationSimulator
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.run_summary import summarise
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME, Master
@@ -175,9 +175,9 @@ def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
     inertial = summary["peak_measured_force_N"]
     left = summary["residual_force_max_N"] if free else None
     makes = {
-        "whole": partial(MakeMovingStation, scenario),
-        "bare": partial(MakeBarePlant, scenario),
-        "plant": partial(MakeBarePlant, scenario, touching=not free),
+        "whole": partial(MakeSettledStationSimulator, scenario),
+        "bare": partial(MakeBarePlantSimulator, scenario),
+        "plant": partial(MakeBarePlantSimulator, scenario, touching=not free),
     }
     seconds = fastest(makes, scenario.simulation.duration)
     return {
@@ -225,7 +225,7 @@ def _pushed(scenario: Scenario, sigma: float) -> tuple[complex, complex]:
         operator__intent=[
             Sine(duration=10.0, ramp=0.5, frequency=_PUSHED, translation=[0.0, 0.0, 0.02])
         ],
-        master=scenario.master.without_coulomb_friction(),
+        master=scenario.master.without_coulomb_friction_and_encoder_steps(),
         simulation__settle=1.5,
         simulation__duration=2 / _PUSHED,
     )

@@ -34,9 +34,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import (
-    GammaSearch,
-    StationTrial,
-    renders_force,
+    OneAxisGammaSearch,
+    StationPressTrial,
+    is_rendered_share_accepted,
     settings_from_values,
 )
 from drake_teleop.lab.tuning.search import meets_requirements
@@ -89,10 +89,10 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
     values = found["settings"]
     settings = settings_from_values(values)
     base = without_task_and_method(scenario, network)
-    search = GammaSearch(base, stated, {})
+    search = OneAxisGammaSearch(base, stated, {})
     axis = OneAxisFromScenario(base, (0.0, 0.0, 1.0))
     axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
-    trial = StationTrial(base, base, stated, identified_load(base, False).estimate)
+    trial = StationPressTrial(base, base, stated, identified_load(base, False).estimate)
     outside_gamma = 1.2 * row["margin"] * settings.gamma
 
     def drawn_walls(low: float, high: float, number: int) -> list[dict[str, Any]]:
@@ -107,7 +107,7 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
             search.share_in_one_axis(axis, settings, gamma, p["hand"], p["wall"], 100 + k)
             for k, p in enumerate(points)
         ]
-        return float(np.mean([not renders_force(share) for share in shares]))
+        return float(np.mean([not is_rendered_share_accepted(share) for share in shares]))
 
     inside = drawn_walls(*stated.walls, asked.station_draws)
     for point in inside:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.master.dynamics import gravity_torque_into
+from drake_teleop.station.master.dynamics import gravity_compensation_torque_into
 
 PHANTOM = Master().device(0.0, 0.0)
 jacobian, forward_kinematics = PHANTOM.jacobian, PHANTOM.forward_kinematics
@@ -15,5 +15,5 @@ def mass_matrix(q, hand_mass=0.0, hand_inertia=0.0):
 
 def gravity_torque(q):
     torque = np.empty(6)
-    gravity_torque_into(q, PHANTOM.parameters, torque)
+    gravity_compensation_torque_into(q, PHANTOM.parameters, torque)
     return torque

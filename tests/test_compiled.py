@@ -194,21 +194,21 @@ def test_borrowing_function_fills_arrays_and_its_callee_allocates():
         for k in range(out.shape[0]):
             out[k] = new[k] * x[k]
 
-    @_compiled.njit(borrows=True)
-    def borrows(pair, out):
+    @_compiled.njit(omits_reference_counting=True)
+    def omits_reference_counting(pair, out):
         for row in range(len(out)):
             makes(pair[0][1:], out[row])
 
     x, out = np.arange(4.0), np.zeros((2, 3))
     before = sys.getrefcount(x), sys.getrefcount(out)
     for _ in range(3):
-        borrows((x, x), out)
+        omits_reference_counting((x, x), out)
     assert out.tolist() == [[2.0, 4.0, 6.0]] * 2
     assert (sys.getrefcount(x), sys.getrefcount(out)) == before
 
 
 def test_borrowing_function_cannot_allocate():
-    @_compiled.njit(borrows=True)
+    @_compiled.njit(omits_reference_counting=True)
     def makes(x):
         x[:] = np.zeros(x.shape[0])
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import drake_teleop
-from drake_teleop.common.config import FieldInfo, check_ranges, fields_of
+from drake_teleop.common.config import FieldInfo, check_all_field_values, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.station.operator.operator import OperatorConfig
@@ -84,7 +84,7 @@ def test_vector_of_another_length_raises(place: str, surplus: int) -> None:
     assert entry.length is not None
     value = [max(entry.low, 0.0)] * (entry.length + surplus)
     with pytest.raises(DrakeTeleopError, match=rf"{entry.name}: .*{len(value)} number"):
-        check_ranges(block(**{entry.name: value}), "scenario")
+        check_all_field_values(block(**{entry.name: value}), "scenario")
 
 
 @pytest.mark.parametrize("place", sorted(LISTS))

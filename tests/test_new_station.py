@@ -105,7 +105,7 @@ def test_rates_match_the_device(tmp_path, runs, device):
     """`analyze` requires that sampling instants coincide."""
     new_command(tmp_path / "mine", ARM, "sensor", device=device)
     scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
-    assert scenario.master.sampling_period(scenario.rates.hand_hz) is None
+    assert scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz) is None
     assert scenario.rates.hand_hz == scenario.rates.joint_control_hz
     linearize(scenario.without_environment(), load_estimate=true_load(scenario))
 

@@ -30,7 +30,11 @@ from drake_teleop.station.oscillation import (
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.run_warnings import find_spans, lag_beyond_delay, run_warnings
+from drake_teleop.station.run_warnings import (
+    find_spans_closing_gaps,
+    lag_beyond_delay,
+    run_warnings,
+)
 from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
@@ -270,9 +274,9 @@ def test_wrist_motor_limit_uses_the_device_axes():
 
 def test_spans_close_gaps_and_skip_short_spans():
     happened = during(0.5, 0.6) | during(0.62, 1.0) | during(2.0, 2.1)
-    assert find_spans(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
-    assert find_spans(T, happened, 0.2) == [(0.5, 1.0)]
-    assert find_spans(T, 0 * T > 1) == []
+    assert find_spans_closing_gaps(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
+    assert find_spans_closing_gaps(T, happened, 0.2) == [(0.5, 1.0)]
+    assert find_spans_closing_gaps(T, 0 * T > 1) == []
 
 
 def test_further_times_are_counted():

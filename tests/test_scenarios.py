@@ -70,7 +70,7 @@ def test_master_stays_within_workspace_and_force(movement):
     _, result = movement
     q = result["master_state"][:, :6]
     assert np.all(margin(q, phantom.JOINT_LOWER_RAD, phantom.JOINT_UPPER_RAD) > np.radians(30))
-    assert np.all(margin(q[:, 1] - q[:, 2], *phantom.FIVE_BAR_RANGE_RAD) > np.radians(20))
+    assert np.all(margin(q[:, 1] - q[:, 2], *phantom.Q2_MINUS_Q3_RANGE_RAD) > np.radians(20))
     force = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     assert np.all(force < 0.2 * phantom.PEAK_FORCE_N)
     assert np.all(np.linalg.norm(result["hand_wrench_E"][:, :3], axis=1) < 30)

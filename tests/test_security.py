@@ -109,10 +109,10 @@ WRITING = {
     # Under a temporary name until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
     ("robots/controller/fmu.py", ".write_text"),  # temporary folder for the compiler
-    ("robots/controller/export.py", ".write_bytes"),  # by `whole_file`
+    ("robots/controller/export.py", ".write_bytes"),  # by `replace_file_on_success`
     # Figures in the file of --json.
     ("live/device_client.py", ".write_text"),
-    # Files in the output folder, by `whole_file`; and a dataset that the package generates.
+    # Files in the output folder, by `replace_file_on_success`; a dataset of the package.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_bytes"),
     # A marker of one byte.
@@ -180,7 +180,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "x.mat": read_table,
     "x.yaml": load_description,
     "log.parquet": SimulationResult.read_parquet,
-    "load-1.npz": identified_load.read_load,
+    "load-1.npz": identified_load.read_cached_load,
     "identification.json": Identification.load,
     "excitation.yaml": FourierTrajectory.load,
     "scenario.yaml": LoadScenario,

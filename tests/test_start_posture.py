@@ -12,21 +12,21 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.new_station.place import (
-    _find_holdable_postures,
+    _find_roomy_holdable_postures,
     _order_postures_to_solve,
     find_start_place,
-    last_joint_axis,
+    sensor_axis_along_last_joint,
 )
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
     _jacobian_singular_values,
-    degrees_of_freedom,
-    elbow_up_share,
-    joint_margins,
+    least_joint_margins,
     postures_at,
     random_postures,
     select_suitable_postures,
+    sensor_degrees_of_freedom,
+    upward_share_of_elbow_offset,
 )
 from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
@@ -44,7 +44,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.posture_shapes import (
     PostureShapes,
     overlap_warnings,
-    start_overlaps,
+    start_overlap_texts,
 )
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -116,7 +116,9 @@ def plain(tmp_path_factory):
 
 
 def elbow_of(plan):
-    return elbow_up_share(postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+    return upward_share_of_elbow_offset(
+        postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]), 1.0
+    )[0]
 
 
 def test_offset_of_a_nearly_straight_arm_has_no_direction():
@@ -128,7 +130,7 @@ def test_offset_of_a_nearly_straight_arm_has_no_direction():
     line = np.array([0.8, 0.0, 0.6])
     offset = origins[2, 1] - (origins[2, 1] @ line) * line
     expected = [1.0, 0.0, offset[2] / np.linalg.norm(offset)]
-    np.testing.assert_allclose(elbow_up_share(postures, 1.0), expected, atol=1e-12)
+    np.testing.assert_allclose(upward_share_of_elbow_offset(postures, 1.0), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("height", "axis"), [(0.1, "y"), (0.0, "y"), (-0.1, "-y")])
@@ -138,7 +140,7 @@ def test_axis_of_the_last_joint_points_away_from_it(height, axis):
     row = table[arm.num_joints]
     row[ROTATION_COLUMN:TRANSLATION_COLUMN] = [0, 0, 1, 1, 0, 0, 0, 1, 0]
     row[TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3] = [0.2, -0.3, height]
-    assert last_joint_axis(replace(arm, table=table)) == axis
+    assert sensor_axis_along_last_joint(replace(arm, table=table)) == axis
 
 
 def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
@@ -151,7 +153,7 @@ def test_posture_of_weak_motors_holds_a_small_part_of_the_load():
     assert (part[0] < 0.7 * limit).all() and (part[1] > 0.7 * limit).any()
     assert (whole > 0.7 * limit).any(axis=1).all()
     weak = replace(arm, effort_limit=limit)
-    np.testing.assert_array_equal(_find_holdable_postures(weak, q), [0])
+    np.testing.assert_array_equal(_find_roomy_holdable_postures(weak, q), [0])
 
 
 def test_singular_values_agree_with_finite_differences_of_turning_and_sliding_joints():
@@ -185,7 +187,7 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     assert (
         plan.posture_shapes.points_on_bodies(plan.posture_shapes.moving_bodies())[:, 2].min() > 0.02
     )
-    assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == ()
+    assert start_overlap_texts(slave_of(plan, path), wall_of_plan(plan))[0] == ()
     assert wall_of_plan(plan).position[2] < plan.lowest_tool_point_W[2] - 0.01
 
 
@@ -208,10 +210,12 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
-    assert start_overlaps(slave, wall_of_plan(plan))[0] == ()
+    assert start_overlap_texts(slave, wall_of_plan(plan))[0] == ()
     elbow = postures_at(plan.posture_shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
-        text for text in start_overlaps(slave, Wall(position=list(elbow)))[0] if "link3" in text
+        text
+        for text in start_overlap_texts(slave, Wall(position=list(elbow)))[0]
+        if "link3" in text
     ]
     assert said.startswith("link3 and wall overlap by ") and " mm at the start" in said
     assert said.endswith("move the object in environment, or give another start in slave.home")
@@ -226,8 +230,10 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain
     )
     drawn = random_postures(endless).q
     assert np.isfinite(drawn).all() and np.abs(drawn).max() <= np.pi
-    assert joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
-    assert joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(0.5)
+    assert least_joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
+    assert least_joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(
+        0.5
+    )
     found = find_start_place(endless)
     assert found.cube_half_m > 0.0 and np.isfinite(found.q).all()
 
@@ -250,7 +256,7 @@ def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
         np.testing.assert_allclose(at_random.p_WS[k], pose[4:], atol=1e-12)
         z = 1 - 2 * (pose[1] ** 2 + pose[2] ** 2)
         assert at_random.R_WS[k, 2, 2] == pytest.approx(z, abs=1e-12)
-    assert degrees_of_freedom(arm, at_random) == 6
+    assert sensor_degrees_of_freedom(arm, at_random) == 6
     # With two wrist joints at rest, the sensor moves in four directions.
     table = np.delete(arm.table, [3, 5], axis=0)
     names = ("joint_names", "lower", "upper", "velocity_limit", "effort_limit")
@@ -258,7 +264,7 @@ def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
     short = replace(
         arm, table=table, **{n: v if n == names[0] else np.array(v) for n, v in fewer.items()}
     )
-    assert degrees_of_freedom(short, random_postures(short)) == 4
+    assert sensor_degrees_of_freedom(short, random_postures(short)) == 4
 
 
 def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
@@ -274,7 +280,7 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     (said,) = [text for text in shapes.assumptions if "overlaps left out" in text]
     assert "link3 and link5" in said and "link1" not in said
     slave = Slave(model=str(path), sensor_frame="ft", tool=plain[1].stand_in_tool, home=[0.3] * 6)
-    assert said in start_overlaps(slave, None)[1]
+    assert said in start_overlap_texts(slave, None)[1]
 
 
 def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
@@ -293,7 +299,9 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
         counts.append({"link2", "link4"} in near)
     assert 0.6 < np.mean(counts) < 0.95
     assert (
-        start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == () == plan.overlap_warnings
+        start_overlap_texts(slave_of(plan, path), wall_of_plan(plan))[0]
+        == ()
+        == plan.overlap_warnings
     )
     assert not any("link2 and link4" in text for text in plan.assumptions)
 
@@ -302,7 +310,7 @@ def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].posture_shapes
     postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
     usable, clear, clear_of_all = _order_postures_to_solve(shapes.arm, postures, region, shapes)
-    expected = _find_holdable_postures(shapes.arm, postures.q)
+    expected = _find_roomy_holdable_postures(shapes.arm, postures.q)
     np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
     assert 3 < len(clear) < len(usable) < len(postures.q)
     assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
@@ -393,8 +401,8 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = q[_find_holdable_postures(weak, q)]
-    roomy = joint_margins(weak, q) > 0.22
+    kept = q[_find_roomy_holdable_postures(weak, q)]
+    roomy = least_joint_margins(weak, q) > 0.22
     assert 0 < roomy.sum() < len(q)
     if share > 1.0:
         np.testing.assert_array_equal(kept, q[roomy])

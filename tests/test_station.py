@@ -22,7 +22,7 @@ from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.master import phantom
-from drake_teleop.station.master.data_sheets import JointFriction
+from drake_teleop.station.master.data_sheets import PhantomJointFriction
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.operator.task import Touch
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
@@ -59,7 +59,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     scenario = replace(
         Scenario(),
         operator=OperatorConfig(grip="firm", intent=[sine]),
-        master__friction=JointFriction([0.0] * 6, [0.0] * 6),
+        master__friction=PhantomJointFriction([0.0] * 6, [0.0] * 6),
         wrist_sensor__ideal=True,
         simulation__settle=1.0,
         simulation__duration=1.0,

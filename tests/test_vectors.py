@@ -43,8 +43,8 @@ def test_vector_functions_equal_numpy(function, arguments, expected, compiled):
 
 def test_add_into_changes_only_the_given_index():
     x = np.zeros(6)
-    vectors.add_into(x, 2, a)
-    vectors.add_into(x, 2, b)
+    vectors.add_vector_into(x, 2, a)
+    vectors.add_vector_into(x, 2, b)
     np.testing.assert_array_equal(x, [0, 0, *(a + b), 0])
 
 

@@ -21,7 +21,7 @@ from drake_teleop.common.files import (
     CannotWrite,
     make_folder,
     output_folder,
-    whole_file,
+    replace_file_on_success,
     write_json,
     write_picture,
     write_table,
@@ -91,7 +91,7 @@ def test_full_disk_raises_one_line_and_keeps_the_earlier_file(tmp_path, name):
 def test_interrupt_keeps_the_earlier_file(tmp_path):
     path = tmp_path / "x"
     path.write_text("earlier")
-    with pytest.raises(KeyboardInterrupt), whole_file(path) as unfinished:
+    with pytest.raises(KeyboardInterrupt), replace_file_on_success(path) as unfinished:
         unfinished.write_text("half")
         raise KeyboardInterrupt
     assert [p.read_text() for p in tmp_path.iterdir()] == ["earlier"]

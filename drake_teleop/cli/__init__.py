@@ -2,12 +2,12 @@
 
 import sys
 
-from drake_teleop.common.interruption import install_handlers
+from drake_teleop.common.interruption import install_interrupt_handlers
 
 
 def start() -> None:
     """Run the command line; handle signals first, because imports can lose a KeyboardInterrupt."""
-    install_handlers()
+    install_interrupt_handlers()
     try:
         from drake_teleop.cli.main import main
     except KeyboardInterrupt:

@@ -19,9 +19,9 @@ from drake_teleop.load.tolerance import (
     QUANTITY_NAMES,
     QUANTITY_UNITS,
     Tolerance,
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, RecordEvaluation, calibrate
 from drake_teleop.robots.connections import open_source_and_recorder
@@ -103,7 +103,10 @@ def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
     values = sizes = np.full(len(units), np.nan)
     if at.identified_log is not None:
         phi = at.identified_log.identification.phi
-        values, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
+        values, sizes = (
+            display_values_of_required_entries(tolerance, phi),
+            tolerances_in_display_units(tolerance, phi),
+        )
     for k, entry in enumerate(tolerance.required_entry_names):
         half = at.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]

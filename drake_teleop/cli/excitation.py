@@ -20,10 +20,13 @@ from drake_teleop.common.files import (
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
-from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
+from drake_teleop.lab.excitation.excite import Excitation, excite, trajectory_sensor_motion
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
 from drake_teleop.lab.excitation.robot import RobotFromModel, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
+from drake_teleop.lab.excitation.shortest import (
+    PROBABILITY_ALL_WITHIN_TOLERANCE,
+    design_shortest_motion,
+)
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import parse_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -76,7 +79,7 @@ def excite_command(
     with show_progress(progress and not quiet) as stage:
         read = stage("Read the robot")
         if model is None:
-            _refuse_model_options(sensor_frame, package_paths, acceleration, payload)
+            _refuse_options_without_model(sensor_frame, package_paths, acceleration, payload)
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
@@ -125,7 +128,11 @@ def excite_command(
                     strict=True,
                 )
             )
-            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
+            reached = {
+                "until": str(tolerance),
+                "reached": shares,
+                "reliable": PROBABILITY_ALL_WITHIN_TOLERANCE,
+            }
     summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.design_cpu_time_s}
     with output_folder(out):
@@ -140,7 +147,7 @@ def excite_command(
     return summary | session
 
 
-def _refuse_model_options(*options: object) -> None:
+def _refuse_options_without_model(*options: object) -> None:
     names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
     for name, value in zip(names, options, strict=True):
         if value not in (None, ()):
@@ -196,7 +203,7 @@ def draw_trajectory(found: Excitation) -> Figure:
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
         _draw_joints(joints, found)
-        _draw_wrench(forces, torques, found)
+        _draw_heaviest_load_wrench(forces, torques, found)
         progress.step(*found.criterion_history.T, where="post", color=BLUE)
         least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
         progress.set(
@@ -217,9 +224,9 @@ def _draw_joints(axes: Axes, found: Excitation) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
+def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
     limits = found.robot.limits
-    s, omega, alpha = sensor_motion(found.robot, found.trajectory)
+    s, omega, alpha = trajectory_sensor_motion(found.robot, found.trajectory)
     wrench = non_contact_wrench(s, omega, alpha, limits.heaviest_phi)
     t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (

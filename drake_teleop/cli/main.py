@@ -14,7 +14,7 @@ import click
 
 from drake_teleop.cli import options as option
 from drake_teleop.common.errors import DrakeTeleopError, to_one_line
-from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_handlers
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_interrupt_handlers
 from drake_teleop.common.version import __version__
 
 
@@ -482,7 +482,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
-_EXPORT_FORMATS = option.RegisteredName(
+_EXPORT_FORMAT_TYPE = option.RegisteredName(
     "export format",
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
     *_CONTROLLER_FORMATS,
@@ -491,7 +491,7 @@ _EXPORT_FORMATS = option.RegisteredName(
 
 @cli.command()
 @click.argument("identification", type=option.PATH_TYPE)
-@click.option("--to", required=True, type=_EXPORT_FORMATS, help="Robot or file format.")
+@click.option("--to", required=True, type=_EXPORT_FORMAT_TYPE, help="Robot or file format.")
 @option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
 @click.option(
     "--sign",
@@ -660,7 +660,7 @@ def tune(
 @option.dask_cluster
 @click.option("--shard", metavar="K/N", help="Run only part K of N, e.g. 3/8; see docs/cluster.md.")
 @click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
-@option.skip_question
+@option.skip_run_count_question
 @option.output_folder("study")
 @option.quiet
 def study(study: Path, out: Path, **options: Any) -> None:
@@ -680,7 +680,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
 @click.option(
     "--repeats", type=option.IntegerInRange(1, 10**6), help="Runs per combination.  [default: 12]"
 )
-@option.skip_question
+@option.skip_run_count_question
 @option.output_folder("scaling-study")
 @option.quiet
 def scaling_study(out: Path, **options: Any) -> None:
@@ -800,7 +800,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     `reproduce` and `calibrate` can have status 1. A live session that the user ends has status 0.
     """
-    install_handlers()
+    install_interrupt_handlers()
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects
     with warnings.catch_warnings():
         # Warnings are for programmers; those for users are in the summary and printed from there.
@@ -821,17 +821,19 @@ def _run_with_exit_status(arguments: list[str] | None) -> Any:
         click.echo(error.format_message())
         return 2
     except click.ClickException as error:
-        return _print_error(error.format_message())
+        return _print_error_and_return_status(error.format_message())
     except DrakeTeleopError as error:
-        return _print_error(str(error))
+        return _print_error_and_return_status(str(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click raises Abort from a KeyboardInterrupt, which contains the message.
         click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         return 130
     except OSError as error:
-        return _print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return _print_error_and_return_status(
+            f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        )
 
 
-def _print_error(message: str) -> int:
+def _print_error_and_return_status(message: str) -> int:
     click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

@@ -53,7 +53,7 @@ SCENARIO_TYPE = ShippedOrPath(scenarios_dir(), str)
 STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 
 
-def _fail_outside_range(
+def _fail_if_outside_range(
     kind: click.FloatRange | click.IntRange,
     number: float,
     param: click.Parameter | None,
@@ -79,7 +79,7 @@ class FiniteNumber(click.FloatRange):
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
-        _fail_outside_range(self, number, param, ctx)
+        _fail_if_outside_range(self, number, param, ctx)
         return number
 
 
@@ -90,7 +90,7 @@ class IntegerInRange(click.IntRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         number: int = click.INT.convert(value, param, ctx)
-        _fail_outside_range(self, number, param, ctx)
+        _fail_if_outside_range(self, number, param, ctx)
         return number
 
 
@@ -253,7 +253,7 @@ def confirm_at_terminal(question: str) -> bool:
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
-skip_question = click.option(
+skip_run_count_question = click.option(
     "--yes",
     is_flag=True,
     callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal,
@@ -304,7 +304,7 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
         package_paths: tuple[Path, ...],
         **options: Any,
     ) -> Any:
-        arm = _arm_from_options(model, sensor_frame, package_paths)
+        arm = _read_arm_kinematics_from_options(model, sensor_frame, package_paths)
         return command(*arguments, arm=arm, **options)
 
     decorated: Callable[..., Any] = call_with_arm
@@ -329,7 +329,7 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return decorated
 
 
-def _arm_from_options(
+def _read_arm_kinematics_from_options(
     model: Path | None, sensor_frame: str | None, package_paths: tuple[Path, ...]
 ) -> Any:
     if model is None:
@@ -345,6 +345,6 @@ def _arm_from_options(
             where="--sensor-frame",
             remedy="name the frame or link at which the sensor measures",
         )
-    from drake_teleop.station.slave.plant import read_arm_kinematics
+    from drake_teleop.station.slave.plant import read_arm_without_default_limits
 
-    return read_arm_kinematics(model, sensor_frame, package_paths)
+    return read_arm_without_default_limits(model, sensor_frame, package_paths)

@@ -56,7 +56,7 @@ class Fault(IntEnum):
     RESUMING = 7
 
 
-FAULT_MEANINGS = {
+FAULT_WARNINGS = {
     Fault.STALE: "the wrist sensor's last sample is too old or too new",
     Fault.READING: "the wrist sensor gives no reading, or an impossibly large one",
     Fault.JOINTS: "the slave's joint angles are not finite or too large",
@@ -69,7 +69,7 @@ FAULT_MEANINGS = {
 
 
 @njit(cache=True)
-def all_in_range(numbers):
+def are_finite_and_in_range(numbers):
     """Return whether all numbers are finite and at most `LARGEST_PORT_VALUE` in magnitude."""
     good = True
     for x in numbers:

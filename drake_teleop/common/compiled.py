@@ -25,16 +25,27 @@ from numba.extending import intrinsic
 
 from drake_teleop.common.errors import DrakeTeleopError
 
-_REPR_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
+_TYPES_IDENTIFIED_BY_REPR = (
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    slice,
+    type(None),
+    type(...),
+    np.dtype,
+    np.generic,
+)
 
 
-def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
+def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
 
-    `borrows` omits reference counting: the function must create no arrays.
+    `omits_reference_counting` omits reference counting: the function must create no arrays.
     """
     # Set in either case, because callees inherit unset options.
-    options["_nrt"] = not borrows
+    options["_nrt"] = not omits_reference_counting
 
     def compile_function(function: FunctionType) -> Any:
         # No function is called from C; omitting the wrappers saves 4 % of the compile time.
@@ -210,7 +221,7 @@ def _constant_text(value: Any) -> str:
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
         return _qualified_name(value)
-    if isinstance(value, _REPR_TYPES):
+    if isinstance(value, _TYPES_IDENTIFIED_BY_REPR):
         return repr(value)
     raise TypeError(f"a cached compiled function uses {value!r}, whose changes are not detected")
 

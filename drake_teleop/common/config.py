@@ -136,7 +136,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
     _check_field_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
 
 
-def check_ranges(config: Any, where: str) -> None:
+def check_all_field_values(config: Any, where: str) -> None:
     """Check types, lengths, ranges and choices of all values of a dataclass, recursively."""
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
@@ -144,7 +144,9 @@ def check_ranges(config: Any, where: str) -> None:
         _check_field_value(field, kinds[field.name], value, place)
         for index, item in enumerate(value if isinstance(value, list) else [value]):
             if dataclasses.is_dataclass(item):
-                check_ranges(item, f"{place}[{index}]" if isinstance(value, list) else place)
+                check_all_field_values(
+                    item, f"{place}[{index}]" if isinstance(value, list) else place
+                )
 
 
 def _check_field_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
@@ -237,30 +239,34 @@ def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> 
         return
     if kind.is_mapping:
         if not isinstance(value, dict) or "_tag" in value:
-            raise _type_error("a mapping of names", value, place, "write {name: value}")
+            raise _make_type_error("a mapping of names", value, place, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(is_mapping=False)
             _check_type(inner, item, f"{place}.{name}", from_file=from_file)
     elif kind.list_depth:
         if not isinstance(value, list):
-            raise _type_error("a list", value, place, "write it in brackets: [...]")
+            raise _make_type_error("a list", value, place, "write it in brackets: [...]")
         inner = FieldType(kind.list_depth - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
     elif first in TYPE_NAMES:
         if not _has_value_type(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _type_error(TYPE_NAMES[first], value, place, remedy if first is float else "")
+            raise _make_type_error(
+                TYPE_NAMES[first], value, place, remedy if first is float else ""
+            )
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_tagged_block(kind.items, value, place), value, place, tagged=several)
+        check_structure(_block_class_of_tag(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"make one: {first.__name__}(...), with fields {fields}"
-        raise _type_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
+        raise _make_type_error(
+            " or ".join(block.__name__ for block in kind.items), value, place, remedy
+        )
 
 
-def _tagged_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
+def _block_class_of_tag(blocks: tuple[type, ...], value: Any, place: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -287,7 +293,7 @@ def _is_numeric_text(value: Any) -> bool:
     return True
 
 
-def _type_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _make_type_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
     return DrakeTeleopError(f"expected {expected}, found {shown}", where=place, remedy=remedy)
 

@@ -67,7 +67,7 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
         raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
 
 
-def refuse_fork() -> None:
+def refuse_polars_in_forked_process() -> None:
     """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
     _POLARS_PROCESS_ID.append(os.getpid())
     del _POLARS_PROCESS_ID[1:]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from drake_teleop.common.errors import DrakeTeleopError, refuse_fork
+from drake_teleop.common.errors import DrakeTeleopError, refuse_polars_in_forked_process
 
 if TYPE_CHECKING:
     import polars as pl
@@ -24,7 +24,7 @@ _RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
 LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
-INPUTS_FILE = "inputs.csv"
+DRIVE_INPUTS_FILE_NAME = "inputs.csv"
 """Name of the file with the inputs of a recorded drive."""
 
 
@@ -33,7 +33,9 @@ class CannotWrite(DrakeTeleopError):
 
 
 @contextmanager
-def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
+def replace_file_on_success(
+    path: Path, *, aside: Path | None = None, shared: bool = False
+) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
     After a failure `path` is unchanged. `aside` is another base of the temporary name; `shared`
@@ -62,7 +64,7 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    with whole_file(path) as temporary:
+    with replace_file_on_success(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -72,7 +74,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
-    with whole_file(path) as temporary:
+    with replace_file_on_success(path) as temporary:
         figure.savefig(temporary, format=path.suffix.removeprefix("."), **options)
 
 
@@ -82,9 +84,9 @@ def write_table(
     """Write CSV, or Parquet for other extensions; pass `options` to polars."""
     import polars as pl
 
-    refuse_fork()
+    refuse_polars_in_forked_process()
     write = table.write_csv if path.suffix == ".csv" else table.write_parquet
-    with whole_file(path, aside=aside) as temporary:
+    with replace_file_on_success(path, aside=aside) as temporary:
         try:
             write(temporary, **options)
         except pl.exceptions.ComputeError as error:  # raised by polars for a full disk
@@ -111,14 +113,14 @@ def output_folder(
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
 
 
-def check_inputs_are_kept(result: Path, given: str | Path | None = None) -> None:
+def refuse_to_replace_inputs(result: Path, given: str | Path | None = None) -> None:
     """Raise DrakeTeleopError if the file `result` would replace `given` or be in a drive's folder.
 
     A `given` that is no file, such as a shipped name, is ignored.
     """
     if not result.exists():
         return
-    what = "a recorded drive" if (result.parent / INPUTS_FILE).exists() else ""
+    what = "a recorded drive" if (result.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
     if given is not None and os.path.isfile(given) and os.path.samefile(given, result):
         what = f"the input {result.name}"
     if what:

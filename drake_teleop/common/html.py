@@ -42,7 +42,7 @@ def png_data_url(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
-def write_report_page(
+def write_report_page_and_pictures(
     out: Path, package: str, pictures: Mapping[str, Figure], **values: Any
 ) -> None:
     """Write NAME.png for each picture, and report.html, which has their data URLs as `pictures`."""

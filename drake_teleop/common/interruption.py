@@ -19,7 +19,7 @@ class _DelayedSignalState(threading.local):
 _DELAYED_SIGNALS = _DelayedSignalState()
 
 
-def install_handlers() -> None:
+def install_interrupt_handlers() -> None:
     """Let SIGTERM, and SIGINT unless ignored, raise KeyboardInterrupt; set `INTERRUPTED_EVENT`."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
@@ -27,8 +27,8 @@ def install_handlers() -> None:
 
 
 @contextmanager
-def handle_sigint() -> Iterator[None]:
-    """Handle SIGINT as `install_handlers` does, in this context and only instead of Python."""
+def raise_interrupt_on_sigint() -> Iterator[None]:
+    """Raise KeyboardInterrupt at SIGINT in this context, if Python would handle it."""
     before = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
     if before is not signal.default_int_handler or not in_main_thread:
@@ -53,7 +53,7 @@ def _raise_interrupt(number: int, _frame: Any) -> None:
 
 
 class delayed_signals(ContextDecorator):
-    """Context or decorator that delays the KeyboardInterrupt of `install_handlers` to its end."""
+    """Context or decorator that delays the KeyboardInterrupt of a signal to its end."""
 
     def __enter__(self) -> None:
         _DELAYED_SIGNALS.open_contexts += 1

@@ -156,7 +156,7 @@ def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]
     ]
 
 
-def narrowest_half_interval(x: Array) -> tuple[Array, Array]:
+def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
     """Return width and centre (k,) of the narrowest interval with half of the samples x (N, k)."""
     ordered = np.sort(x, axis=0)
     half = len(ordered) // 2
@@ -166,7 +166,7 @@ def narrowest_half_interval(x: Array) -> tuple[Array, Array]:
     return widths[start, channels], centres
 
 
-def parabola_minimum(left: float, middle: float, right: float) -> float:
+def position_of_parabola_minimum(left: float, middle: float, right: float) -> float:
     """Return where a parabola through values at -1, 0 and 1 is least, limited to this interval."""
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

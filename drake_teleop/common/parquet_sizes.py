@@ -10,7 +10,7 @@ from typing import Any
 _MAGIC_BYTES = b"PAR1"
 _FOOTER_END_BYTES = 8  # bytes: length of the footer, and magic
 _DATA_PAGE_TYPE, _DICTIONARY_PAGE_TYPE, _DATA_PAGE_V2_TYPE = 0, 2, 3
-_REPEATED_FIELD = 2
+_REPETITION_TYPE_REPEATED = 2
 # Type codes of Thrift.
 _TRUE, _FALSE, _BYTE_TYPE, _DOUBLE_TYPE, _BINARY_TYPE, _STRUCT_TYPE = 1, 2, 3, 7, 8, 12
 _INTEGER_TYPES, _LIST_TYPES = (4, 5, 6), (9, 10)
@@ -43,7 +43,7 @@ def _check_sizes_in_file(content: bytes | mmap.mmap) -> None:
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require_undamaged(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
-    columns = list(_leaf_columns(footer[2]))
+    columns = list(_leaf_names_and_is_flat(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     _require_undamaged(
@@ -58,14 +58,14 @@ def _check_sizes_in_file(content: bytes | mmap.mmap) -> None:
             _check_column(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _leaf_columns(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
+def _leaf_names_and_is_flat(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
             above.pop()
         left, is_flat = above[-1]
         above[-1] = left - 1, is_flat
-        is_flat = is_flat and element.get(3) != _REPEATED_FIELD
+        is_flat = is_flat and element.get(3) != _REPETITION_TYPE_REPEATED
         if children := _read_size(element, 5, "children", 0):
             above.append((children, is_flat))
         elif element is not schema[0]:

@@ -91,7 +91,7 @@ def signed_permutations() -> list[Array]:
     ]
 
 
-def axis_names(P: Array) -> list[str]:
+def axis_names_of_rows(P: Array) -> list[str]:
     """Return the names of the rows of a signed permutation P (3, 3), such as ["-y", "x", "z"]."""
     return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in P]
 

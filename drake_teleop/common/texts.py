@@ -19,7 +19,7 @@ import yaml
 from drake_teleop.common.errors import DrakeTeleopError, field_place, to_one_line
 
 _MAX_YAML_VALUES = 50_000  # including repetitions by aliases
-_MAX_BRACKETS = 50  # nested brackets
+_MAX_BRACKET_NESTING = 50  # nested brackets
 _MAX_INTEGER_DIGITS = 18  # digits, always within 64 bits
 
 _TAG_PREFIX = "tag:yaml.org,2002:"
@@ -39,7 +39,9 @@ class _YamlLoader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level >= _MAX_BRACKETS:  # PyYAML scans thousands before it creates nodes
+        if (
+            self.flow_level >= _MAX_BRACKET_NESTING
+        ):  # PyYAML scans thousands before it creates nodes
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 

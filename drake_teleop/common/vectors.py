@@ -44,7 +44,7 @@ def transposed(R):
 
 
 @register_jitable
-def add_into(x, i, a):
+def add_vector_into(x, i, a):
     """Add the vector a to 3 numbers of the array x, from index i."""
     x[i] += a[0]
     x[i + 1] += a[1]

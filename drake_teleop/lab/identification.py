@@ -21,7 +21,7 @@ from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import fit_noise_floor
-from drake_teleop.load.contact.noise_floor import NoiseFloor, limit_covariance
+from drake_teleop.load.contact.noise_floor import NoiseFloor, limit_covariance_to_scales
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.recursive_tls import METHODS
@@ -36,14 +36,14 @@ from drake_teleop.station.scenario import (
 )
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import ArmModel, sensor_accelerations
+from drake_teleop.station.slave.arm import ArmModel, accelerations_from_specific_forces
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
 
 # The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0
 #: Designed trajectory and its criterion kappa_w10, by a hash of all inputs of the design.
-_TRAJECTORY_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
+_TRAJECTORIES_AND_KAPPAS: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,12 +81,12 @@ class LoadIdentification:
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
         contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
-        a = sensor_accelerations(arm, self.result["joint_position"][usable], s)
-        P = limit_covariance(phi, self.batch.covariance)
+        a = accelerations_from_specific_forces(arm, self.result["joint_position"][usable], s)
+        P = limit_covariance_to_scales(phi, self.batch.covariance)
         return fit_noise_floor(contact, s, omega, alpha, a, P)
 
     @property
-    def recursive_against_batch(self) -> float:
+    def max_recursive_minus_batch_in_stds(self) -> float:
         """Largest difference of recursive and batch estimate, in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
@@ -151,13 +151,15 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _design_trajectory(scenario, stage)
+            trajectory, kappa = _cached_trajectory_and_kappa(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
             _check_trajectory(robot, trajectory, simulation.duration)
             kappa = criterion_values(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
-        result, factor = simulate_with_timing(station, simulation, stage("Identify the load"), log)
+        result, factor = simulate_with_real_time_factor(
+            station, simulation, stage("Identify the load"), log
+        )
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
@@ -190,15 +192,19 @@ def identify_by_batch(
     return found.identification
 
 
-def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
+def _cached_trajectory_and_kappa(
+    scenario: Scenario, stage: StartStage
+) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
-    if key not in _TRAJECTORY_CACHE or scenario.environment:  # the environment's files may change
+    if (
+        key not in _TRAJECTORIES_AND_KAPPAS or scenario.environment
+    ):  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
-        _TRAJECTORY_CACHE[key] = found, criterion_values(robot, found)["kappa_w10"]
-    return copy.deepcopy(_TRAJECTORY_CACHE[key])
+        _TRAJECTORIES_AND_KAPPAS[key] = found, criterion_values(robot, found)["kappa_w10"]
+    return copy.deepcopy(_TRAJECTORIES_AND_KAPPAS[key])
 
 
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
@@ -221,7 +227,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
         )
 
 
-def simulate_with_timing(
+def simulate_with_real_time_factor(
     station: Diagram, simulation: Simulation, progress: UpdateProgress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
     """Return the result of a simulation, and simulated time over elapsed time."""

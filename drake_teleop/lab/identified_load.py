@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.files import CannotWrite, make_folder, models_dir, whole_file
+from drake_teleop.common.files import CannotWrite, make_folder, models_dir, replace_file_on_success
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage
 from drake_teleop.common.version import __version__
@@ -67,13 +67,13 @@ def identified_load(
     path = (folder or cache_folder()) / f"load-{_cache_key(before, detects)}.npz"
     # A registered estimator may have changed since.
     fresh = fresh or before.load_estimator.method not in METHODS.shipped
-    if not fresh and (cached := read_load(path)) is not None:
+    if not fresh and (cached := read_cached_load(path)) is not None:
         return cached
     found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
     with suppress(CannotWrite, OSError):  # next time the load is identified again
-        write_load(path, load)
+        write_cached_load(path, load)
     return load
 
 
@@ -104,7 +104,7 @@ def _cache_key(before: Scenario, detects: bool) -> str:
     return sha256(repr(what).encode()).hexdigest()
 
 
-def write_load(path: Path, load: IdentifiedLoad) -> None:
+def write_cached_load(path: Path, load: IdentifiedLoad) -> None:
     """Write a cache file atomically; remove the oldest files above `MAX_CACHED_FILES`."""
     columns = {
         f"{name}.{field.name}": getattr(part, field.name)
@@ -113,14 +113,14 @@ def write_load(path: Path, load: IdentifiedLoad) -> None:
         for field in dataclasses.fields(part)
     }
     make_folder(path.parent)
-    with whole_file(path, shared=True) as unfinished, unfinished.open("wb") as file:
+    with replace_file_on_success(path, shared=True) as unfinished, unfinished.open("wb") as file:
         np.savez(file, **columns)
     files = [(each.stat().st_mtime_ns, each) for each in path.parent.glob("load-*")]
     for _, old in sorted(files)[:-MAX_CACHED_FILES]:
         old.unlink(missing_ok=True)
 
 
-def read_load(path: Path) -> IdentifiedLoad | None:
+def read_cached_load(path: Path) -> IdentifiedLoad | None:
     """Return the load in a cache file; None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:

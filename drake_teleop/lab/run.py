@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     CannotWrite,
-    check_inputs_are_kept,
     output_folder,
+    refuse_to_replace_inputs,
     remove_log,
     wrap_write_errors,
     write_json,
@@ -18,7 +18,7 @@ from drake_teleop.common.files import (
     write_table,
 )
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
-from drake_teleop.lab.identification import identify_load, simulate_with_timing
+from drake_teleop.lab.identification import identify_load, simulate_with_real_time_factor
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, draw_overview, summarise
 from drake_teleop.station.result import SimulationResult
@@ -26,7 +26,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_LOAD_FOUND_IN_RUN = "estimated during the run"
+_LOAD_SOURCE_OF_RUN = "estimated during the run"
 _SCENARIO_FILE_NAME = "scenario.yaml"
 _RESULT_FILE_NAMES = (
     "sensor_log.parquet",
@@ -77,7 +77,7 @@ def run_command(
             where="run --inputs",
             remedy="remove --seed and --fresh",
         )
-    check_inputs_are_kept(out / _SCENARIO_FILE_NAME, scenario)
+    refuse_to_replace_inputs(out / _SCENARIO_FILE_NAME, scenario)
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
@@ -151,16 +151,20 @@ def run_scenario(
     if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
-            scenario, found.result, found.identification, _LOAD_FOUND_IN_RUN, found.real_time_factor
+            scenario,
+            found.result,
+            found.identification,
+            _LOAD_SOURCE_OF_RUN,
+            found.real_time_factor,
         )
-    identification, estimate, floor, source = None, None, None, _LOAD_FOUND_IN_RUN
+    identification, estimate, floor, source = None, None, None, _LOAD_SOURCE_OF_RUN
     with show_progress(progress) as stage:
         if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        result, factor = simulate_with_timing(
+        result, factor = simulate_with_real_time_factor(
             station, scenario.simulation, stage("Run the scenario"), log
         )
     return ScenarioRun(scenario, result, identification, source, factor)

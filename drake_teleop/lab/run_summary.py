@@ -23,7 +23,7 @@ from drake_teleop.station.run_warnings import run_warnings
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.posture_shapes import start_overlaps
+from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 from drake_teleop.station.task_measures import task_failure, task_measures
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
         summary["failure"] = task_failure(result, run.scenario) or None
-    _, assumed = start_overlaps(run.scenario.slave, run.scenario.surroundings)
+    _, assumed = start_overlap_texts(run.scenario.slave, run.scenario.surroundings)
     if assumed:
         summary["assumed"] = list(assumed)
     return summary | {"warnings": run_warnings(result, run.scenario, arm)}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identification import slave_arm
@@ -105,7 +105,7 @@ class PageValueCalculator:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
-                yield from (FAULT_MEANINGS[Fault(int(fault))] for fault in sorted(faults))
+                yield from (FAULT_WARNINGS[Fault(int(fault))] for fault in sorted(faults))
         if rows["ik_status"].max() >= IkStatus.OUT_OF_REACH:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:

@@ -70,7 +70,7 @@ class DeviceClient:
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None
 
-    def exchange_packets(
+    def exchange_packets_and_render_wrench(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
         """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
@@ -181,7 +181,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         while time.perf_counter() < end:
             largest = max(
-                largest, float(np.linalg.norm((client.exchange_packets() or (0.0,) * 3)[:3]))
+                largest,
+                float(
+                    np.linalg.norm((client.exchange_packets_and_render_wrench() or (0.0,) * 3)[:3])
+                ),
             )
     except KeyboardInterrupt:
         pass

@@ -20,7 +20,7 @@ COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_S = 0.02  # s
 _FORCE_LIMIT_RISE_AFTER_SILENCE_N_S = 100.0  # N/s
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
-_OBSERVER_DAMPING_NS_M = 100.0  # N s/m
+_MAX_OBSERVER_DAMPING_NS_M = 100.0  # N s/m
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class DeviceGuard:
         self._position, self._velocity = x, velocity
 
         share = self._allowed_force_fraction(age, period)
-        force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
+        force, torque = _zeros_if_any_not_finite(wrench[:3]), _zeros_if_any_not_finite(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
         torque = _limit_norm(share * torque, limits.torque)
@@ -94,11 +94,13 @@ class DeviceGuard:
             return force
         self.slowed += 1
         force_along = returned / distance
-        max_force = max(available / distance, -_OBSERVER_DAMPING_NS_M * math.hypot(*self._velocity))
+        max_force = max(
+            available / distance, -_MAX_OBSERVER_DAMPING_NS_M * math.hypot(*self._velocity)
+        )
         return force - max(force_along - max_force, 0.0) / distance * next_motion
 
 
-def _finite_or_zero(a: Sequence[float]) -> Array:
+def _zeros_if_any_not_finite(a: Sequence[float]) -> Array:
     vector = np.array(a, dtype=float)
     return vector if math.isfinite(vector.sum()) else np.zeros(3)
 

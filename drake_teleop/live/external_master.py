@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
@@ -65,7 +65,7 @@ def _pose_and_twist_on_path_into(path, time, out):
 @njit(cache=True)
 def _update_displayed_wrench(wrench, held, period, limits, last, now):
     fault = 0.0
-    if not all_in_range(wrench):
+    if not are_finite_and_in_range(wrench):
         fault = _WRENCH_FAULT_NUMBER
     enabled = held and fault == 0.0
     change = _WRENCH_LIMIT_RETURN_PER_S if enabled else -1.0 / _WRENCH_LIMIT_FADE_S

@@ -123,7 +123,7 @@ def _start_path_into(path, time, now, target, poles):
         path[_ROTATION_INDEX + k], path[_RATE_INDEX + k] = rotation[k], rate[k]
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
     _intended_motion_into(path, time, pose, intention)
     for k in range(3):
@@ -151,7 +151,7 @@ class LiveHand(Operator):
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
         self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
 
-    def _declare_intended_motion(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
         path[_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
         path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = self._intent[1]

@@ -40,7 +40,7 @@ SceneFunction = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 FRAME_PERIOD_S = 1 / 60
 _MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
-DISPLAYED_TOUCH_FORCE_N = 0.12
+MIN_DISPLAYED_TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
 # of messages.
 _MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
@@ -146,7 +146,7 @@ class Live:
             "ranges": {name: input_range(name) for name in INPUT_RANGES},
             "names": choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
-            "touch": DISPLAYED_TOUCH_FORCE_N,
+            "touch": MIN_DISPLAYED_TOUCH_FORCE_N,
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
@@ -225,7 +225,7 @@ class Live:
             self.pace.begin_slice(now)
             self._simulate_slice(now)
         now = clock()
-        self._poll_device(now)
+        self._wake_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._alone_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._stop_on_failure(self._session.write_log)
@@ -238,7 +238,7 @@ class Live:
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
-    def _poll_device(self, now: float) -> None:
+    def _wake_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
         self._alone_since = now
@@ -271,7 +271,7 @@ class Live:
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
-            pressed = self._session.contact_force() > DISPLAYED_TOUCH_FORCE_N
+            pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
             self._show_now |= pressed and not self._pressed
             self._pressed = pressed
         if self._link is not None and not self.stopped:

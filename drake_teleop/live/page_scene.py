@@ -45,7 +45,7 @@ class PageScene:
             self.objects = _scene_objects_json(meshcat.StaticHtml())
             self._scene.canvas = _SceneChangeRecorder()  # only this thread may destroy Meshcat
         except _SCENE_FAILURE_EXCEPTIONS as error:
-            self._report_failure(error)
+            self._report_scene_failure(error)
 
     def frame_part(self, rows: LogRows) -> dict[str, Any]:
         """Return a message: poses (4x4, by columns) and sizes of the last row by Meshcat path."""
@@ -59,11 +59,11 @@ class PageScene:
             self._scene.show_sample(0.0, rows, -1)
         except _SCENE_FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
-                self._report_failure(error)
+                self._report_scene_failure(error)
             return {}
         return moves.rounded_changes()
 
-    def _report_failure(self, error: BaseException) -> None:
+    def _report_scene_failure(self, error: BaseException) -> None:
         self.failure = to_one_line(f"no 3D scene: {error}")
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 

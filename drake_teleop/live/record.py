@@ -14,9 +14,14 @@ from typing import Any
 
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.common.files import INPUTS_FILE, make_folder, wrap_write_errors, write_text
+from drake_teleop.common.files import (
+    DRIVE_INPUTS_FILE_NAME,
+    make_folder,
+    wrap_write_errors,
+    write_text,
+)
 from drake_teleop.common.version import __version__
-from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
+from drake_teleop.lab.identified_load import IdentifiedLoad, write_cached_load
 from drake_teleop.live.inputs import Inputs, csv_header, csv_row
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, referenced_files
@@ -50,7 +55,7 @@ class SessionRecord:
         device: bool,
     ) -> None:
         make_folder(folder)
-        self._folder, path, self._last = folder, folder / INPUTS_FILE, ""
+        self._folder, path, self._last = folder, folder / DRIVE_INPUTS_FILE_NAME, ""
         with wrap_write_errors(path):  # mode x never overwrites another recorded drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
@@ -61,7 +66,7 @@ class SessionRecord:
                     "x to rz of inputs.csv are the places of a device.\n",
                 )
             if load is not None:
-                write_load(folder / LOAD_FILE, load)
+                write_cached_load(folder / LOAD_FILE, load)
             self._append_line(csv_header(versions_and_file_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
@@ -92,7 +97,7 @@ class SessionRecord:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):  # the folder contains other files
-            for name in (INPUTS_FILE, SCENARIO_FILE, LOAD_FILE, DEVICE_MARKER_FILE):
+            for name in (DRIVE_INPUTS_FILE_NAME, SCENARIO_FILE, LOAD_FILE, DEVICE_MARKER_FILE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()
 

@@ -28,7 +28,7 @@ DEFAULT_OBJECT = Payload(mass=0.8)
 CROSS_FADE_S = 0.25
 # Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
 # ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
-_MIN_ROTATIONAL_WAVE_IMPEDANCE = 0.5
+_MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD = 0.5
 _DELAY_INPUT_UNIT_S, _JITTER_INPUT_UNIT, _LOSS_INPUT_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the user.
@@ -83,7 +83,8 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
     if method == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
         wave = dataclasses.replace(
-            scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE)]
+            scenario.passivity.wave,
+            impedance=[along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD)],
         )
         changes["passivity__wave"] = wave
     name = NETWORKS[inputs.network]

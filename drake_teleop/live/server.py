@@ -97,7 +97,7 @@ class LiveDrive:
         try:
             self._ready.wait()
         except KeyboardInterrupt:
-            self._stop_threads()
+            self._stop_threads_or_exit_process()
             raise
         self._raise_failure()
 
@@ -130,7 +130,7 @@ class LiveDrive:
             while not self._over.wait(0.2):
                 pass
         finally:
-            self._stop_threads()
+            self._stop_threads_or_exit_process()
         self._raise_failure()
 
     def wait_for_signal(self) -> str:
@@ -152,7 +152,7 @@ class LiveDrive:
         for thread in self._threads:
             thread.join()
 
-    def _stop_threads(self) -> None:
+    def _stop_threads_or_exit_process(self) -> None:
         """Stop all threads; Python may crash at exit while compiled code runs."""
         self._stop.set()
         end = time.monotonic() + _THREAD_END_TIMEOUT_S

@@ -15,10 +15,10 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import INPUTS_FILE
+from drake_teleop.common.files import DRIVE_INPUTS_FILE_NAME
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import UpdateProgress
-from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
+from drake_teleop.lab.identified_load import IdentifiedLoad, read_cached_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.inputs import SLICE_MS, Inputs, read_inputs
@@ -92,7 +92,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     simulator.set_monitor(set_step_mode)
 
 
-def add_missing_signals(log: SimulationResult) -> SimulationResult:
+def add_placeholders_of_missing_signals(log: SimulationResult) -> SimulationResult:
     """Return the log with signals that some stations lack."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
@@ -143,7 +143,7 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def continue_from_station(self, other: _Station, new_channel: bool) -> float:
+    def copy_state_and_get_clutch_wait_s(self, other: _Station, new_channel: bool) -> float:
         """Copy another station's state; return how long the clutch must stay open [s]."""
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
@@ -208,7 +208,9 @@ class Session:
             self._record = SessionRecord(record, scenario, load, self.inputs, device=device)
         self._on_disk: BackgroundLog | None = None
         if log is not None:
-            self._on_disk = BackgroundLog(log, self._station.simulator, 0.0, add_missing_signals)
+            self._on_disk = BackgroundLog(
+                log, self._station.simulator, 0.0, add_placeholders_of_missing_signals
+            )
         self._earlier_rows: list[SimulationResult] = []
         self._station.simulator.Initialize()
 
@@ -236,7 +238,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.continue_from_station(
+        wait_s = station.copy_state_and_get_clutch_wait_s(
             self._station, inputs.channel_choices != self.inputs.channel_choices
         )
         if wait_s:
@@ -314,7 +316,9 @@ class Session:
             self._on_disk.wait_until_written()
 
     def _recorded_signals(self) -> SimulationResult:
-        return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
+        return add_placeholders_of_missing_signals(
+            read_recorded_signals(self._station.simulator, 0.0)
+        )
 
     def log(self) -> SimulationResult:
         parts = [*self._earlier_rows, self._recorded_signals()]
@@ -365,8 +369,8 @@ class RecordedDrive:
 def read_drive(folder: str | Path) -> RecordedDrive:
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO_FILE)
-    changes = read_inputs(folder / INPUTS_FILE, versions_and_file_digest(scenario))
-    load = read_load(folder / LOAD_FILE)
+    changes = read_inputs(folder / DRIVE_INPUTS_FILE_NAME, versions_and_file_digest(scenario))
+    load = read_cached_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):
         raise DrakeTeleopError(

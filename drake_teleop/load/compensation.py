@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, to_float
-from drake_teleop.common.vectors import add_into, cross, minus, plus, scale_vector, vector_at
+from drake_teleop.common.vectors import add_vector_into, cross, minus, plus, scale_vector, vector_at
 from drake_teleop.load.regressor import wrench_of_load
 
 
@@ -39,7 +39,7 @@ def scaled_wrench_as_tuples(
 
 
 @register_jitable
-def scaled_weight_as_tuples(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
+def excess_weight_as_tuples(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
     """Return force and torque of the sum of both weights, each times its excess."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
@@ -59,18 +59,22 @@ def scaled_wrench_into(
 
 
 @njit(cache=True)
-def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    force, torque = scaled_weight_as_tuples(
+def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
+    force, torque = excess_weight_as_tuples(
         gravity, phi_gripper, phi_object, excess_gripper, excess_object
     )
-    add_into(out, 0, force)
-    add_into(out, 3, torque)
+    add_vector_into(out, 0, force)
+    add_vector_into(out, 3, torque)
 
 
 @njit(cache=True)
-def _add_weights_of_rows(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
+def _add_excess_weights_of_rows(
+    gravity, phi_gripper, phi_object, excess_gripper, excess_object, out
+):
     for i in range(out.shape[0]):
-        add_weight_into(gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i])
+        add_excess_weight_into(
+            gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i]
+        )
 
 
 @njit(cache=True)
@@ -132,7 +136,7 @@ def scaled_wrench(
             sigma_gripper and sigma_object.
         gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia have other scales.
     """
-    weights, inertias = weight_and_inertia_scales(
+    weights, inertias = weight_scales_and_inertia_scales(
         _check_scale("sigma_gripper", sigma_gripper),
         _check_scale("sigma_object", sigma_object),
         None if sigma_weight is None else _check_scale("sigma_weight", sigma_weight),
@@ -152,11 +156,11 @@ def scaled_wrench(
             gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6)
         )
         excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
-        _add_weights_of_rows(down, *phis, *excess, out)
+        _add_excess_weights_of_rows(down, *phis, *excess, out)
     return out.reshape(*leading, 6)
 
 
-def weight_and_inertia_scales(
+def weight_scales_and_inertia_scales(
     sigma_gripper: float,
     sigma_object: float,
     sigma_weight: float | None = None,

@@ -131,7 +131,7 @@ class SecondMoments:
             _add_sample_products(*chunk, part, self._blocks, self._state)
             self._sums += part + np.triu(part, 1).T
 
-    def noise_covariance(self, noise: NoiseStd, wrench: Array) -> Array:
+    def mean_noise_covariance_of_z(self, noise: NoiseStd, wrench: Array) -> Array:
         """Return the mean covariance (19, 19) of z by noise, with wrench noise (6,) [N, N m]."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
@@ -222,7 +222,9 @@ class SecondMoments:
         power = self.residual_squares(theta)
         if self._resolution is not None:
             absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
-            return *self._static_variances(power, absorbed, theta), np.zeros(6, dtype=bool)
+            return *self._residual_variances_of_poses_at_rest(power, absorbed, theta), np.zeros(
+                6, dtype=bool
+            )
         variances, degrees = self._unbiased_residual_variances(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
@@ -265,7 +267,9 @@ class SecondMoments:
         degrees = np.where(weaker, longest_degrees, degrees)
         return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_RESIDUAL**2 * wrench)
 
-    def _static_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
+    def _residual_variances_of_poses_at_rest(
+        self, power: Array, absorbed: Array, theta: Array
+    ) -> tuple[Array, Array]:
         assert self._resolution is not None
         squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
         min_variance = np.array(self._resolution) ** 2 / 12.0

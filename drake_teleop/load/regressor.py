@@ -115,7 +115,7 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
     return out.reshape(*leading, 6)
 
 
-def signals_of_sample(num_joints: int) -> dict[str, int]:
+def signal_sizes_of_sample(num_joints: int) -> dict[str, int]:
     """Return the signals of a wrist sensor's sample and their sizes, in order."""
     return {
         "measured_wrench_S": 6,

@@ -113,14 +113,14 @@ def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
     return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
-def required_values(tolerance: Tolerance, phi: Array) -> Array:
+def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Array:
     """Return the values (k,) of the numbers in `tolerance` for load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
-def tolerances_in_units(tolerance: Tolerance, phi: Array) -> Array:
+def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
     """Return the absolute tolerances (k,) for a load phi (10,) [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}

@@ -13,7 +13,7 @@ from drake_teleop.common.files import write_text
 from drake_teleop.common.numeric import Array
 
 _FILE_FIELDS, _FIELDS_PER_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
-_MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]
+_MAX_FILE_NUMBER = 1e6  # of any number in a file [rad, Hz]
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class FourierTrajectory:
             what = "is not a trajectory: q0, rho and delta differ in shape, a number is not finite,"
             what += " or the frequency is not above 0"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
-        if np.abs(numbers).max() > _MAX_NUMBER:
-            what = f"contains numbers above {_MAX_NUMBER:g}"
+        if np.abs(numbers).max() > _MAX_FILE_NUMBER:
+            what = f"contains numbers above {_MAX_FILE_NUMBER:g}"
             raise DrakeTeleopError(what, where=where, remedy="give rad and Hz")
         return cls(q0, rho, delta, frequency)
 

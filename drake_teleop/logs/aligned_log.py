@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, narrowest_half_interval, one_blas_thread
+from drake_teleop.common.numeric import Array, narrowest_half_width_and_centre, one_blas_thread
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.compensation import contact_wrench
@@ -32,7 +32,7 @@ from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import (
     choose_delay,
-    far_from_gaps,
+    is_far_from_gaps,
     is_near_ends,
     low_pass,
     low_pass_log,
@@ -41,7 +41,7 @@ from drake_teleop.logs.read.alignment import (
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.table_files import yaml_only_note
+from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
 _MAX_KNOWN_DELAY_STD_S = 0.005  # s, standard deviation
 _EDGE_MARGIN_OVER_KNOT_SPACING = 2.0
@@ -55,11 +55,13 @@ _CHUNK_SAMPLES, _FILTER_NEIGHBOURS = 2**14, 2**8
 _PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
 
 
-def _estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
+def _estimate_motion_load_and_delay_source(
+    log: Log, delay: str | float
+) -> tuple[PoseEstimate, str]:
     """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
     assert log.posed is not None
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
-    return _fit_with_usual_delay_if_undetermined(
+    return _fit_with_fallback_delay_if_undetermined(
         log, log.posed, delay, estimate, 0.0, "undetermined"
     )
 
@@ -76,14 +78,14 @@ def fit_motion_to_known_load(
         return None
     fit = partial(fit_motion_to_load, load=load)
     with suppress(DrakeTeleopError):  # too short
-        found, source = _fit_with_usual_delay_if_undetermined(
+        found, source = _fit_with_fallback_delay_if_undetermined(
             log, log.posed, delay, fit, usual_s, "load"
         )
         return (found, source) if found.is_imu_consistent_with_poses else None
     return None
 
 
-def _fit_with_usual_delay_if_undetermined(
+def _fit_with_fallback_delay_if_undetermined(
     log: Log,
     posed: PosesOfLog,
     delay: str | float,
@@ -100,7 +102,7 @@ def _fit_with_usual_delay_if_undetermined(
     return found, source
 
 
-def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
+def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
     """Return the log with motion from splines of poses, and (N,) True near ends and gaps."""
     assert log.posed is not None
     moved, splines = remove_delay(log, found.delay_s), found.splines
@@ -171,7 +173,7 @@ def read_aligned_log(
         found = fit_motion_to_known_load(log, delay, coefficients, usual_s)
     if found is not None:
         motion, source = found
-        moved, one_sided = use_spline_motion(log, motion)
+        moved, one_sided = use_spline_motion_and_flag_edges(log, motion)
         plain = remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
             moved = replace_specific_force_by_acceleration(moved)
@@ -190,10 +192,13 @@ def read_aligned_log(
     log = remove_delay(log, delay_s)
     other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
     candidates = [other] if smooth is None else [smooth, other]
-    return min(candidates, key=lambda aligned: _log_residual_spread(aligned, phi, cutoff_hz))
+    return min(
+        candidates,
+        key=lambda aligned: _summed_logarithms_of_residual_spread(aligned, phi, cutoff_hz),
+    )
 
 
-def missing_orientation_error(where: str) -> DrakeTeleopError:
+def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",
@@ -205,18 +210,20 @@ def missing_orientation_error(where: str) -> DrakeTeleopError:
 def replace_specific_force_by_acceleration(log: Log) -> Log:
     """Return the log with acceleration in place of specific force, by adding gravity."""
     if log.gravity is None:
-        raise missing_orientation_error(log.source)
+        raise removed_weight_needs_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 
-def _log_residual_spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
+def _summed_logarithms_of_residual_spread(
+    aligned: AlignedLog, phi: Array, cutoff_hz: float | None
+) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
-    return float(np.log(narrowest_half_interval(left[~aligned.edge])[0] + 1e-12).sum())
+    return float(np.log(narrowest_half_width_and_centre(left[~aligned.edge])[0] + 1e-12).sum())
 
 
 @dataclass(frozen=True)
-class PosedFit:
+class LoadFitOfPosedLog:
     """Load identified from a log with poses, after removal of the delay `delay_s` [s].
 
     Attributes:
@@ -233,7 +240,7 @@ class PosedFit:
 
 def fit_load_to_posed_log(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
-) -> tuple[PosedFit | None, tuple[Finding, ...]]:
+) -> tuple[LoadFitOfPosedLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
 
     The load is None for a method without splines, a log without usable poses, or an IMU that
@@ -241,15 +248,17 @@ def fit_load_to_posed_log(
     """
     if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
-    found, source = _estimate_motion_and_load(log, delay)
+    found, source = _estimate_motion_load_and_delay_source(log, delay)
     finding = None if log.estimated else pose_unit_or_frame_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.is_rotated and not found.frame.is_shifted
         if not found.is_imu_consistent_with_poses or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
-    moved, one_sided = use_spline_motion(_reduce_log_rate(log, cutoff_hz), found)
-    shown = low_pass_log(moved, cutoff_hz).select_rows(far_from_gaps(moved, cutoff_hz) & ~one_sided)
+    moved, one_sided = use_spline_motion_and_flag_edges(_reduce_log_rate(log, cutoff_hz), found)
+    shown = low_pass_log(moved, cutoff_hz).select_rows(
+        is_far_from_gaps(moved, cutoff_hz) & ~one_sided
+    )
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
@@ -257,9 +266,11 @@ def fit_load_to_posed_log(
         fit = replace(fit, identification=fit.identification.with_unidentified_load())
     if finding is not None:
         fit = replace(fit, note="")
-        finding = replace(finding, message=f"{finding.message}{yaml_only_note(log.source)}")
+        finding = replace(
+            finding, message=f"{finding.message}{note_that_table_needs_description(log.source)}"
+        )
     findings = () if finding is None else (finding,)
-    return PosedFit(shown, fit, found.delay_s, source, found), findings
+    return LoadFitOfPosedLog(shown, fit, found.delay_s, source, found), findings
 
 
 def _reduce_log_rate(log: Log, cutoff_hz: float | None) -> Log:
@@ -301,7 +312,9 @@ def _batch_result_of_estimate(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    return BatchResult(load, noise, rejected, _note_on_estimate(found, gain_std), equations)
+    return BatchResult(
+        load, noise, rejected, _note_on_disturbances_clock_and_misfit(found, gain_std), equations
+    )
 
 
 def _physically_consistent_theta(found: PoseEstimate) -> Array:
@@ -314,7 +327,7 @@ def _physically_consistent_theta(found: PoseEstimate) -> Array:
     return consistent_least_squares(gram, gram @ theta, theta)
 
 
-def _note_on_estimate(found: PoseEstimate, stated: float) -> str:
+def _note_on_disturbances_clock_and_misfit(found: PoseEstimate, stated: float) -> str:
     notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "

@@ -16,7 +16,7 @@ CAUSAL_MODES = ("delayed", "predicted")
 
 
 @dataclass(frozen=True)
-class CausalWrench:
+class CausalContactAndScaledWrench:
     """Contact and scaled wrenches of N samples, each computed from past samples only.
 
     Attributes:
@@ -46,13 +46,13 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
         return x
     from scipy.signal import lfilter
 
-    low_pass = low_pass_coefficients(dt, cutoff_hz, ahead_s)
+    low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
     b, a, settled = low_pass[:3], [1.0, *low_pass[3:5]], low_pass[5:]
     at_first = settled.reshape(2, *[1] * (x.ndim - 1)) * x[:1]
     return lfilter(b, a, x, axis=0, zi=at_first)[0]
 
 
-def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> Array:
+def low_pass_and_settled_state(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> Array:
     low_pass = np.empty(7)
     design_low_pass(dt, math.tan(math.pi * cutoff_hz * dt), ahead_s, low_pass)
     return low_pass
@@ -86,7 +86,7 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
 
 def compute_causal_wrench(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
-) -> CausalWrench:
+) -> CausalContactAndScaledWrench:
     """Return the filtered wrenches that a control loop has at each instant.
 
     The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
@@ -105,4 +105,6 @@ def compute_causal_wrench(
         rows = np.maximum(np.arange(len(filtered)) - wait, 0)
         return filtered[rows]
 
-    return CausalWrench(mode, lag, filter_and_delay(contact), filter_and_delay(scaled))
+    return CausalContactAndScaledWrench(
+        mode, lag, filter_and_delay(contact), filter_and_delay(scaled)
+    )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half_interval
+from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half_width_and_centre
 from drake_teleop.load.contact.detection import (
-    MAX_NOISE_LEVEL,
+    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
     ContactDetector,
     central_axis_of_wrenches,
     fit_noise_floor,
@@ -37,8 +37,13 @@ _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
 _CUTOFF_WITHOUT_LOW_PASS_HZ = 30.0  # assumed cut-off without a low-pass
 _MIN_FLOOR_BLOCK_DURATION_S, _MIN_FLOOR_BLOCKS = 0.1, 20
 _QUIET_HALF_ITERATIONS, _NUM_CONTACT_REMOVAL_ROUNDS = 4, 3
-_THRESHOLD_OVER_MAXIMUM, _MIN_STATISTIC_MAXIMUM = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
-_MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
+_THRESHOLD_OVER_MAXIMUM, _MIN_STATISTIC_MAXIMUM = (
+    1.6,
+    5.0,
+)  # times 1.25 is about `NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES`
+_MAX_SAMPLES_FOR_NOISE_FLOOR = (
+    30_000  # largest number of samples for a noise floor, in spans of ten blocks
+)
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
 _MAX_CONTACT_SHARE, _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
@@ -100,7 +105,7 @@ def detect_contact(
     identification [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
     period = 1.0 / (cutoff_hz or _CUTOFF_WITHOUT_LOW_PASS_HZ)
-    inner = _select_judged_samples(rows, dt, period, edge)
+    inner = _rows_far_from_ends_and_edges(rows, dt, period, edge)
     judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
         return None
@@ -108,11 +113,13 @@ def detect_contact(
     # A held value decays by the factor e within a period.
     if free is None:
         fade = math.exp(-dt / period)
-        floor, threshold, train = _fit_floor_to_log(judged, dt, hold, fade, covariance, statistic)
+        floor, threshold, train = _fit_floor_and_threshold_to_log(
+            judged, dt, hold, fade, covariance, statistic
+        )
     else:
-        train = free[0].select_rows(_select_judged_samples(free[0], free[1], period))
+        train = free[0].select_rows(_rows_far_from_ends_and_edges(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
-        threshold = max(MAX_NOISE_LEVEL, floor.threshold(statistic))
+        threshold = max(NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
     detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
     values[inner] = statistics_of_log(floor, *judged)
@@ -128,11 +135,11 @@ def detect_contact(
         free_duration_s=len(train.contact) * (dt if free is None else free[1]),
         force_threshold=THRESHOLD_OVER_MAX
         * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
-        notes=() if free is not None else _detection_notes(floor, touched, usual),
+        notes=() if free is not None else _notes_if_mostly_contact(floor, touched, usual),
     )
 
 
-def _select_judged_samples(
+def _rows_far_from_ends_and_edges(
     rows: DetectorSamples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
 ) -> slice | NDArray[np.bool_]:
     ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
@@ -144,14 +151,14 @@ def _select_judged_samples(
     return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
-def _fit_floor_to_log(
+def _fit_floor_and_threshold_to_log(
     rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
     block = max(hold, round(_MIN_FLOOR_BLOCK_DURATION_S / dt))
-    selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_FLOOR_SAMPLES) == 0
+    selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_SAMPLES_FOR_NOISE_FLOOR) == 0
     quiet = _find_quiet_samples(rows.contact, noise_floor(rows.contact))
     if (quiet & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
         quiet = selected = np.ones(n, bool)
@@ -213,7 +220,7 @@ def _remove_marginal_contacts(
             touched[start:stop] = False
 
 
-def _detection_notes(
+def _notes_if_mostly_contact(
     floor: NoiseFloor, touched: NDArray[np.bool_], usual: Array
 ) -> tuple[str, ...]:
     remedy = "; give a log of free motion with --free"
@@ -232,7 +239,7 @@ def _detection_notes(
     return ()
 
 
-def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
+def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
@@ -248,7 +255,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
     `residual` (N, 6) is the wrench without that of the load [N, N m].
     """
-    offsets = narrowest_half_interval(residual)[1]
+    offsets = narrowest_half_width_and_centre(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):
         distance = np.abs(residual - offsets)
@@ -263,7 +270,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 def noise_floor(contact: Array) -> Array:
     """Return the RMS noise (6,) of a contact wrench (N, 6), half free of contact, Eq. (T12)."""
-    floor = narrowest_half_interval(contact)[0] / 1.349
+    floor = narrowest_half_width_and_centre(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet

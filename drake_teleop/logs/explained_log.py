@@ -16,8 +16,8 @@ from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import has_negative_mass
 from drake_teleop.logs.causes.cause import Cause
-from drake_teleop.logs.causes.explain import Explanation, explain_misfit
-from drake_teleop.logs.causes.instants import Instants, block_means_of_record
+from drake_teleop.logs.causes.explain import MisfitExplanation, explain_misfit
+from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record
 from drake_teleop.logs.causes.intervals import load_bias_by_alpha_noise
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -27,7 +27,7 @@ from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.table_files import yaml_only_note
+from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
@@ -48,7 +48,7 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 
 def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
     """Add the corrected lines of the log description to the messages of causes."""
-    _, texts, corrected = _correct_fields(causes, log, by_pose)
+    _, texts, corrected = _corrected_fields_and_texts_by_cause(causes, log, by_pose)
     return tuple(
         replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
         for cause, text, fields in zip(causes, texts, corrected, strict=True)
@@ -59,7 +59,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     """Return a message on wrong units for a mass above 1000 kg, None for a smaller one."""
     if abs(mass) < _MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _correct_fields(causes, log, by_pose=True)[0]
+    fields = _corrected_fields_and_texts_by_cause(causes, log, by_pose=True)[0]
     ratio = fields["wrench.torque.scale"] / fields["wrench.force.scale"]
     text = _yaml_value("wrench.torque.scale", ratio)
     return (
@@ -67,11 +67,12 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set wrench.force.scale to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and wrench.torque.scale to {text} times that{yaml_only_note(log.source)}"
+        f" and wrench.torque.scale to {text} times that"
+        f"{note_that_table_needs_description(log.source)}"
     )
 
 
-def _correct_fields(
+def _corrected_fields_and_texts_by_cause(
     causes: Sequence[Cause], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
     assert log.described is not None
@@ -81,7 +82,7 @@ def _correct_fields(
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         if cause.name == "gain":
-            _correct_gain(fields, cause.values, column)
+            _correct_scale_of_gain_channel(fields, cause.values, column)
         elif cause.name in _CORRECTION_OF_CAUSE:
             _CORRECTION_OF_CAUSE[cause.name](fields, cause.values)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
@@ -92,7 +93,9 @@ def _correct_fields(
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _REMEDY_OF_CAUSE_WITHOUT_FIELD.get(cause.name, "")
-        texts.append(f"set {lines}{yaml_only_note(log.source)}" if lines else otherwise)
+        texts.append(
+            f"set {lines}{note_that_table_needs_description(log.source)}" if lines else otherwise
+        )
     return fields, texts, corrected
 
 
@@ -143,7 +146,7 @@ def _yaml_value(name: str, value: Any) -> str:
     return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
 
 
-def _correct_axes(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _correct_wrench_sign_and_frame(fields: DescriptionFields, values: dict[str, Any]) -> None:
     Q = np.array(values["matrix"])
     sign = 1 if np.linalg.det(Q) > 0.0 else -1
     base = isinstance(fields["wrench.frame"], str)
@@ -154,22 +157,24 @@ def _correct_axes(fields: DescriptionFields, values: dict[str, Any]) -> None:
         fields["wrench.frame"] = sign * Q.T @ fields["wrench.frame"]
 
 
-def _correct_sensor_rotation(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _rotate_described_frames_and_positions(
+    fields: DescriptionFields, values: dict[str, Any]
+) -> None:
     R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
     for name in {*_ROTATION_FIELDS, *_POSITION_FIELDS} & set(fields):
         fields[name] = R @ fields[name]
 
 
-def _correct_gravity(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _correct_gravity_direction(fields: DescriptionFields, values: dict[str, Any]) -> None:
     true = np.array(values["gravity"])
     fields["gravity"] = true * np.linalg.norm(fields["gravity"]) / np.linalg.norm(true)
 
 
-def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _mark_weight_as_removed(fields: DescriptionFields, values: dict[str, Any]) -> None:
     fields["wrench.weight"] = "removed"
 
 
-def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _correct_unit_or_torque_scale(fields: DescriptionFields, values: dict[str, Any]) -> None:
     force = SI_VALUE_OF_UNIT[fields["wrench.force.unit"]]
     torque = SI_VALUE_OF_UNIT[fields["wrench.torque.unit"]]
     ratios = [
@@ -183,7 +188,7 @@ def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
     fields["wrench.torque.scale"] = fields["wrench.torque.scale"] / values["factor"]
 
 
-def _correct_gain(
+def _correct_scale_of_gain_channel(
     fields: DescriptionFields, values: dict[str, Any], column: list[int] | None
 ) -> None:
     if column is None:
@@ -194,40 +199,42 @@ def _correct_gain(
     fields[name][column[c % 3]] /= values["gain"]
 
 
-def _correct_pose_frame(fields: DescriptionFields, values: dict[str, Any]) -> None:
+def _shift_pose_and_imu_positions(fields: DescriptionFields, values: dict[str, Any]) -> None:
     for name in _POSITION_FIELDS:
         if name in fields:
             fields[name] = fields[name] + values["position_in_sensor"]
 
 
 _CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
-    "axes": _correct_axes,
-    "sensor rotation": _correct_sensor_rotation,
-    "gravity direction": _correct_gravity,
-    "weight removed": _correct_removed_weight,
-    "payload configured": _correct_removed_weight,  # an estimated payload would count as exact
-    "torque factor": _correct_units,
-    "pose frame": _correct_pose_frame,
+    "axes": _correct_wrench_sign_and_frame,
+    "sensor rotation": _rotate_described_frames_and_positions,
+    "gravity direction": _correct_gravity_direction,
+    "weight removed": _mark_weight_as_removed,
+    "payload configured": _mark_weight_as_removed,  # an estimated payload would count as exact
+    "torque factor": _correct_unit_or_torque_scale,
+    "pose frame": _shift_pose_and_imu_positions,
 }
 
 
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
-_MIN_INSTANTS_TO_EXPLAIN = 100
+_MIN_BLOCK_MEANS_TO_EXPLAIN = 100
 _MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
 _BLOCK_MEAN_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
-def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
+def explain_log(
+    log: Log, delay_s: float, found: PoseEstimate | None = None
+) -> MisfitExplanation | None:
     """Search for causes why a rigid load does not explain the wrench; None for a short log."""
 
-    def instants_at_delay(more: float) -> Instants:
+    def instants_at_delay(more: float) -> BlockMeans:
         late = delay_s + more
         if found is not None:
-            return _spline_instants(log, found, late)
+            return _block_means_of_splines(log, found, late)
         return block_means_of_log(remove_delay(log, late))
 
     data = instants_at_delay(0.0)
-    if data.used.sum() < _MIN_INSTANTS_TO_EXPLAIN:
+    if data.used.sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
     why = explain_misfit(data, instants_at_delay, log.estimated)
     if log.described is None:
@@ -236,7 +243,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     return replace(why, causes=causes)
 
 
-def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
+def _block_means_of_splines(log: Log, found: PoseEstimate, late: float) -> BlockMeans:
     assert log.posed is not None
     splines, gravity = found.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
@@ -269,9 +276,9 @@ def _noise_of_spline_acceleration(splines: PoseSplines) -> float:
     return float(np.sqrt(np.trapezoid(power, f)))
 
 
-def explained_load(load: Identification, why: Explanation) -> Identification:
+def explained_load(load: Identification, why: MisfitExplanation) -> Identification:
     """Return the load fitted with the causes; without causes, `load` with wider intervals."""
-    load = _load_with_wider_intervals(load, why)
+    load = _load_with_causes_or_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load
     extra = load_bias_by_alpha_noise(why.state)
@@ -282,7 +289,9 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identification:
+def _load_with_causes_or_wider_intervals(
+    load: Identification, why: MisfitExplanation
+) -> Identification:
     if not why.causes and not why.always_fitted:
         if why.explained or not load.identifiable.any():
             return load
@@ -316,7 +325,7 @@ def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identi
     )
 
 
-def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
+def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Cause, ...]:
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
@@ -324,7 +333,7 @@ def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...
     return why.causes
 
 
-def unexplained_finding(why: Explanation) -> Finding:
+def unexplained_finding(why: MisfitExplanation) -> Finding:
     """Return the finding that a misfit has no known cause."""
     ratio = why.state.residual_ratio
     return Finding(
@@ -334,7 +343,7 @@ def unexplained_finding(why: Explanation) -> Finding:
     )
 
 
-def removed_weight_note(why: Explanation) -> str:
+def removed_weight_note(why: MisfitExplanation) -> str:
     if "weight" not in why.always_fitted or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

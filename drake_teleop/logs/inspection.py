@@ -61,11 +61,13 @@ def inspect_command(
         and (table := read_table(log)).columns.keys() >= _CANONICAL_WRENCH_COLUMNS
     ):
         summary["kind"] = "canonical"
-        _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
+        _inspect_described_log(
+            _describe_canonical_without_nan_rows(log, table), str(log), {log: table}, summary
+        )
     else:
         drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
-            _write_draft(join_drafts(drafts), _free_draft_path(out), summary)
+            _correct_and_write_draft(join_drafts(drafts), _free_draft_path(out), summary)
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -73,7 +75,7 @@ def inspect_command(
     return summary
 
 
-def _describe_canonical(log: Path, table: Table) -> Description:
+def _describe_canonical_without_nan_rows(log: Path, table: Table) -> Description:
     try:
         return describe_canonical(log, table)
     except DrakeTeleopError:
@@ -125,7 +127,7 @@ def _with_checksum(text: str) -> str:
     return f"{text}{_CHECKSUM_LINE_START}{sha256(text.encode()).hexdigest()[:16]}\n"
 
 
-def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
+def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     write_text(path, _with_checksum(draft.text()))
     summary["draft"] = str(path)
     places = ", ".join(_places_to_fill_in(draft.streams))
@@ -175,8 +177,10 @@ def _inspect_described_log(
     for name, stream in description.streams.items():
         if stream.source not in tables:
             tables[stream.source] = read_stream_table(stream)
-        table = tables[stream.source].rows_with_numbers(stream.columns)
-        figures, more, rows = _inspect_stream(name, stream, table, description, source)
+        table = tables[stream.source].rows_with_any_number(stream.columns)
+        figures, more, rows = _inspect_stream_and_find_bad_rows(
+            name, stream, table, description, source
+        )
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
@@ -202,7 +206,7 @@ def _inspect_described_log(
     return findings
 
 
-def _inspect_stream(
+def _inspect_stream_and_find_bad_rows(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
@@ -217,7 +221,7 @@ def _inspect_stream(
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
     if time is not None:
-        more, usable = _inspect_clock(at, time, table, len(values), figures)
+        more, usable = _inspect_clock_and_flag_usable_rows(at, time, table, len(values), figures)
         findings += more
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
@@ -280,7 +284,7 @@ def _repeated_rows_findings(
     return [Finding("repeated rows", f"{at}: {what}; {remedy}")]
 
 
-def _inspect_clock(
+def _inspect_clock_and_flag_usable_rows(
     at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
     if time.column is None:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from drake_teleop.common.files import whole_file
+from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import (
     BLACK,
@@ -105,7 +105,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
     """Write the image of two PNG files of equal width, one above the other, to `page`."""
     from matplotlib.image import imread, imsave
 
-    with whole_file(page) as unfinished:
+    with replace_file_on_success(page) as unfinished:
         imsave(unfinished, np.concatenate([imread(upper), imread(lower)]), format="png")
 
 

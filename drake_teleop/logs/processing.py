@@ -19,9 +19,9 @@ from drake_teleop.load.compensation import (
     scaled_wrench,
     scales_from_eta,
     unknown_gravity_error,
-    weight_and_inertia_scales,
+    weight_scales_and_inertia_scales,
 )
-from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_index
+from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales, statistic_index
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -30,13 +30,13 @@ from drake_teleop.logs.aligned_log import (
     fit_load_to_posed_log,
     read_aligned_log,
 )
-from drake_teleop.logs.causal import CausalWrench, compute_causal_wrench
+from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import CAUSES_WITHOUT_CORRECTION, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
-    Conventions,
-    check_file,
-    check_suspicious_load,
+    ConventionCheckResult,
+    check_conventions_of_file,
+    findings_if_load_is_suspicious,
     motion_findings,
 )
 from drake_teleop.logs.check.corrections import FINDINGS_CAUSED_BY_MISFIT, Finding
@@ -45,7 +45,7 @@ from drake_teleop.logs.contact import (
     Detection,
     detect_contact,
     noise_floor,
-    offset_shift_note,
+    note_on_drift_or_much_contact,
     robust_offsets,
     samples_for_detector,
 )
@@ -59,7 +59,7 @@ from drake_teleop.logs.explained_log import (
 )
 from drake_teleop.logs.read.alignment import (
     choose_delay,
-    far_from_gaps,
+    is_far_from_gaps,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -144,7 +144,7 @@ class EliminatedLog:
     scaled: Array
     gravity_only: Array | None
     noise_floor: Array
-    causal: CausalWrench | None
+    causal: CausalContactAndScaledWrench | None
     edge: NDArray[np.bool_]
     detection: Detection | None = None
     findings: tuple[Finding, ...] = ()
@@ -163,7 +163,7 @@ def identify_log(
     method: str = DEFAULT_METHOD,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
-    checks: Conventions | None = None,
+    checks: ConventionCheckResult | None = None,
 ) -> IdentifiedLog:
     """Identify the load and the sensor offsets from a log.
 
@@ -175,11 +175,11 @@ def identify_log(
         method: "ordinary", "whitened", "total", "robust", "consistent" or a registered name.
         cutoff_hz: cut-off of the low-pass; None for no filter.
         delay: delay of the motion behind the wrench [s], or "auto".
-        checks: result of `check_file` for this log, if known.
+        checks: result of `check_conventions_of_file` for this log, if known.
     """
     METHODS.check(method, "method")
     _check_log_arguments(path, cutoff_hz)
-    check = partial(check_file, Path(path)) if checks is None else lambda: checks
+    check = partial(check_conventions_of_file, Path(path)) if checks is None else lambda: checks
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     posed, other = fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
@@ -223,7 +223,9 @@ def identify_log(
     if errors:
         findings = errors
     elif not causes and not raw.estimated:
-        findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
+        findings = (
+            findings_if_load_is_suspicious(log, result, predicted, known_delay, check) or other
+        )
         if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
@@ -253,7 +255,7 @@ def _fit_load_to_motion(
 ) -> tuple[Log, BatchResult, float, str]:
     delay_s, source = choose_delay(log, cutoff_hz, delay)
     log = remove_delay(log, delay_s)
-    log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
+    log = low_pass_log(log, cutoff_hz).select_rows(is_far_from_gaps(log, cutoff_hz))
     fit = identify_batch(
         log.wrench,
         *log.motion,
@@ -289,9 +291,9 @@ def _is_readable(path: Path) -> bool:
     return True
 
 
-def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
+def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
     """Check a log and its description, including causes that identification finds."""
-    checks = check_file(path) if checks is None else checks
+    checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
     except DrakeTeleopError as error:
@@ -378,7 +380,7 @@ def eliminate_log(
     if gripper is not None:
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
         load_of_object(identification, alone)  # raises an error for exchanged files
-        phi_gripper = usable_phi(alone)[0]
+        phi_gripper = phi_with_inertia_replaced(alone)[0]
     eliminated = partial(
         _read_and_eliminate_log,
         identification=identification,
@@ -394,7 +396,9 @@ def eliminate_log(
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
-        raise _static_log_error((free_motion if free_motion.log.static else found).log)
+        raise _no_contact_in_static_log_error(
+            (free_motion if free_motion.log.static else found).log
+        )
     if found.log.static:
         return found
     samples = samples_for_detector(found.log, found.contact, cutoff_hz)
@@ -402,17 +406,17 @@ def eliminate_log(
     if free_motion is not None:
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
-    covariance = limit_covariance(found.phi, identification.covariance, tared=tare)
+    covariance = limit_covariance_to_scales(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
     usual = identification.residual_rms
     detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
     if free_motion is not None and tare and detection is not None:
-        notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
+        notes = note_on_drift_or_much_contact(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
 
-def _static_log_error(log: Log) -> DrakeTeleopError:
+def _no_contact_in_static_log_error(log: Log) -> DrakeTeleopError:
     what = "contains only poses at rest (`static`), in which no contact can be detected"
     return DrakeTeleopError(what, where=log.source, remedy="give a log of a motion")
 
@@ -434,7 +438,7 @@ def _read_and_eliminate_log(
         what = "a contact-free start requires `causal`, the mode of wrenches as in a control loop"
         remedy = "give causal as well, or remove it"
         raise DrakeTeleopError(what, where="causal_tare_s", remedy=remedy)
-    phi = usable_phi(identification)[0]
+    phi = phi_with_inertia_replaced(identification)[0]
     phi_object = phi - phi_gripper
     known_load = phi, identification.delay_s
     removed = identification.weight_removed
@@ -444,7 +448,7 @@ def _read_and_eliminate_log(
         raise DrakeTeleopError(
             "poses at rest have no times for a causal filter", where="causal", remedy="leave it out"
         )
-    known = far_from_gaps(log, cutoff_hz)
+    known = is_far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
     def low_pass_wrench(wrench: Array) -> Array:
@@ -462,7 +466,7 @@ def _read_and_eliminate_log(
     motion = log.motion
     gravity_only = None
     removed = removed or "weight" in log.estimated
-    _require_gravity_for_scales(log, removed, scales)
+    _require_gravity_for_unequal_scales(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
@@ -494,7 +498,9 @@ def _read_and_eliminate_log(
             scaled=causal_wrench.scaled[known],
         )
     contact = low_pass_wrench(contact)
-    findings = _find_suspected_errors(Path(path), log.wrench - offsets, contact, identification)
+    findings = _findings_if_contact_is_large(
+        Path(path), log.wrench - offsets, contact, identification
+    )
     notes = (*log.notes, *notes_on_undetermined_load(identification))
     # A wrong description would explain the clock, too.
     shown = replace(shown, notes=notes if findings else (*notes, *aligned.clock_notes))
@@ -542,7 +548,7 @@ def _rows_of_contact_free_start(log: Log, length_s: float) -> NDArray[np.bool_]:
     return rows
 
 
-def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
+def phi_with_inertia_replaced(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     """Return phi (10,) with undetermined inertias set to those of a point mass, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
@@ -559,13 +565,13 @@ def notes_on_undetermined_load(load: Identification) -> tuple[str, ...]:
         f"{', '.join(names)} of the load are not identified: {effect}"
         for names, effect in (
             (moments, "their errors are in the contact wrench; identify the load again"),
-            (usable_phi(load)[1], "those of a point mass are used"),
+            (phi_with_inertia_replaced(load)[1], "those of a point mass are used"),
         )
         if names
     )
 
 
-def _find_suspected_errors(
+def _findings_if_contact_is_large(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
@@ -577,7 +583,7 @@ def _find_suspected_errors(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
-def weight_scale_error(where: str) -> DrakeTeleopError:
+def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         "the robot has removed the weight, so that sigma_weight has no effect",
         where=where,
@@ -585,13 +591,13 @@ def weight_scale_error(where: str) -> DrakeTeleopError:
     )
 
 
-def _require_gravity_for_scales(log: Log, removed: bool, scales: dict[str, Any]) -> None:
+def _require_gravity_for_unequal_scales(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     sigmas = {name: value for name, value in scales.items() if name != "gamma"}
-    weights, inertias = weight_and_inertia_scales(**sigmas)
+    weights, inertias = weight_scales_and_inertia_scales(**sigmas)
     if weights == inertias:
         return
     if removed:
-        raise weight_scale_error(log.source)
+        raise weight_scale_without_effect_error(log.source)
     if log.gravity is None:
         raise unknown_gravity_error(
             f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
@@ -658,7 +664,7 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise _static_log_error(found.log)
+        raise _no_contact_in_static_log_error(found.log)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
         remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples"

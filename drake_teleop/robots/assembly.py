@@ -16,8 +16,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import quaternions_from_matrices, rotation_matrices
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.logs.aligned_log import missing_orientation_error
-from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.aligned_log import removed_weight_needs_orientation_error
+from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW_OVER_PERIOD,
     polynomial_fit_weights,
@@ -68,7 +68,10 @@ class DelayTracker:
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
     ) -> None:
         self.delay_s = delay_s
-        self._phi, self._noise = tuple(usable_phi(load)[0]), white_wrench_noise(load, dt, cutoff_hz)
+        self._phi, self._noise = (
+            tuple(phi_with_inertia_replaced(load)[0]),
+            white_wrench_noise(load, dt, cutoff_hz),
+        )
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
         self._reset_estimate(-math.inf)
@@ -149,7 +152,7 @@ _MIN_MOTION_PERIOD_S, _MAX_TIME_STAMP_S, _MAX_MOTION_VALUE = 1e-4, 1e11, 1e5  # 
 _MOTION_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
-class ReadingStreams(Source):
+class WrenchAndMotionStreams(Source):
     """Source of wrenches and motions, from one or two sources; `where` names them."""
 
     def __init__(
@@ -334,7 +337,7 @@ class ReadingAssembler(Source):
 
     def __init__(
         self,
-        streams: ReadingStreams,
+        streams: WrenchAndMotionStreams,
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
@@ -343,7 +346,7 @@ class ReadingAssembler(Source):
         weight_removed: bool = False,
     ) -> None:
         if weight_removed and streams.motion_stream == IMU:
-            raise missing_orientation_error("the source")
+            raise removed_weight_needs_orientation_error("the source")
         self._streams, self._delay, self.dt = streams, delay_s, streams.dt
         self._tracker = None
         if track is not None:

@@ -51,7 +51,7 @@ _ADVISED_MOTIONS = (
 )
 _ADVISED_MOTION_S, _ADVISED_MOTION_SAMPLES = 4.0, 80
 # Independent samples per second and hertz of the low-pass.
-_SAMPLES_PER_CUTOFF_PERIOD = 2.2
+_INDEPENDENT_SAMPLES_PER_CUTOFF_PERIOD = 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def evaluate_record(
     phi, noise, log = _ASSUMED_PHI, _ASSUMED_WRENCH_NOISE, None
     if found is not None:
         load, log = found.identification, found.log
-        half, wider, degrees = half_widths_over_tolerances(found, tolerance)
+        half, wider, degrees = half_widths_and_dof_over_tolerances(found, tolerance)
         doubts = doubts_about_record(found)
         sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
@@ -118,7 +118,7 @@ def evaluate_record(
     return RecordEvaluation(t, found, why, half, sure, known, doubts, advice)
 
 
-def half_widths_over_tolerances(
+def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: Tolerance
 ) -> tuple[Array, Array, Array]:
     """Return (k,) each: half-widths (95 %, `TOLERANCE_CONFIDENCE`), degrees of freedom."""
@@ -153,7 +153,11 @@ def advise_motion(
 
     `motion` is s, omega, alpha of the record, (N, 3) each.
     """
-    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
+    rate = (
+        1.0 / dt
+        if cutoff_hz is None
+        else min(1.0 / dt, _INDEPENDENT_SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
+    )
     equations = SecondMoments(noise)
     equations.add_samples(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]

@@ -18,7 +18,7 @@ from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Cause, causes_of_fit
 from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
-from drake_teleop.logs.causes.state import State
+from drake_teleop.logs.causes.state import FittedModel
 from drake_teleop.robots.compensator import CLOCK_JUMP_S
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
@@ -32,11 +32,11 @@ TESTED_RECORD_SPAN_S = 20.0
 MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
 _TEST_TRIGGER_FLAGS = int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD)
-_INVALID_FLAGS = ~int(NONZERO_WRENCH_FLAGS)
+_UNTESTED_READING_FLAGS = ~int(NONZERO_WRENCH_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
-_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE = 0.5  # m/s^2, standard deviation
+_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2 = 0.5  # m/s^2, standard deviation
 _CHANGE_TEST_NICENESS, _CHANGE_TEST_TIMEOUT_S = 10, 60.0
 
 TimedChangeText = tuple[float, str]
@@ -56,7 +56,7 @@ class ChangeMonitor:
         self._reported: list[float] = []
 
     def add_reading(self, reading: Reading, flags: int) -> None:
-        if flags & _INVALID_FLAGS:
+        if flags & _UNTESTED_READING_FLAGS:
             return
         if not 0.0 < reading.t - self._last < CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
@@ -74,7 +74,7 @@ class ChangeMonitor:
             self._next_attempt = t + min(
                 max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since)), _MAX_TEST_SPACING_S
             )
-            find = _find_changes_in_process if self._live else find_changes
+            find = _find_changes_in_process if self._live else find_zero_and_load_changes
             self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
         if self._pending is not None and (self._pending.done() or not self._live):
             self._report_changes(self._pending)
@@ -116,7 +116,7 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[TimedChangeText]:
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 
-def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
+def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
@@ -126,7 +126,7 @@ def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     lost = np.abs(rows[at, 0] - t) > dt
     state = explain_misfit(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
     return [
-        (cause.start_s, _change_text(cause))
+        (cause.start_s, _text_of_zero_or_load_change(cause))
         for cause in causes_of_fit(state)
         if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
@@ -134,10 +134,13 @@ def find_changes(rows: Array, dt: float) -> list[TimedChangeText]:
     ]
 
 
-def _is_change_kind_certain(state: State, time: float) -> bool:
+def _is_change_kind_certain(state: FittedModel, time: float) -> bool:
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE_SIGNALS]
-    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE:
+    if (
+        len(after) == 0
+        or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2
+    ):
         return False
     own = next(step for step in steps if step.time == time)
     other = StepChange("offsets" if own.kind == "load" else "load", own.time)
@@ -147,7 +150,7 @@ def _is_change_kind_certain(state: State, time: float) -> bool:
     return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _KIND_LIKELIHOOD_RATIO
 
 
-def _change_text(cause: Cause) -> str:
+def _text_of_zero_or_load_change(cause: Cause) -> str:
     if cause.name == "zero change":
         change = " ".join(f"{x:+.3g}" for x in np.array(cause.values["change"]))
         return (
@@ -164,7 +167,7 @@ def main() -> None:
     if hasattr(os, "nice"):
         os.nice(_CHANGE_TEST_NICENESS)
     rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_READING_VALUES)
-    json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
+    json.dump(find_zero_and_load_changes(rows, float(sys.argv[1])), sys.stdout)
 
 
 if __name__ == "__main__":

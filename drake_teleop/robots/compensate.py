@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.files import move_earlier_recordings
-from drake_teleop.common.interruption import INTERRUPTED_EVENT, handle_sigint
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
@@ -76,7 +76,7 @@ def compensate_stream(
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _STALE_WRENCH_PERIOD_S) if left > 0.0 else _STALE_WRENCH_PERIOD_S
 
-    with suppress(KeyboardInterrupt), handle_sigint():
+    with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
         while (
             not INTERRUPTED_EVENT.is_set()
             and (readings := source.read(longest_read_timeout_s())) is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.load.compensation import add_weight_into, scaled_wrench_into
+from drake_teleop.load.compensation import add_excess_weight_into, scaled_wrench_into
 
 VALUE_NOT_FINITE, VALUE_TOO_LARGE, VALUE_AT_RANGE = 1, 2, 4
 TARE_IN_MOTION, TARE_WRENCH_VARIES, TARE_EXCEEDS_DRIFT = 1, 2, 3
@@ -59,7 +59,7 @@ def contact_and_scaled_wrench_into(
     a, b, c = scales[0], scales[1], scales[2]
     scaled_wrench_into(wrench, offsets, s, omega, alpha, no_load, phi, a, b, c, scaled)
     if scales[3] != 0.0:
-        add_weight_into(gravity, no_load, phi, 0.0, scales[3], scaled)
+        add_excess_weight_into(gravity, no_load, phi, 0.0, scales[3], scaled)
     rest[at, :15] = values
     rest[at, 15:] = contact
     if len(low_pass) > 0:

@@ -14,8 +14,11 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import unknown_gravity_error
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
-from drake_teleop.logs.processing import usable_phi, weight_scale_error
+from drake_teleop.logs.causal import filter_lag, low_pass_and_settled_state
+from drake_teleop.logs.processing import (
+    phi_with_inertia_replaced,
+    weight_scale_without_effect_error,
+)
 from drake_teleop.robots.compensation_step import (
     MAX_FORCE_OFFSET_DRIFT_N,
     MAX_TORQUE_OFFSET_DRIFT_NM,
@@ -122,7 +125,7 @@ class Compensator:
         watch: ContactAndLoadMonitor | None = None,
         detector: StreamContactDetector | None = None,
     ) -> None:
-        self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
+        self._phi, self._zero_phi = phi_with_inertia_replaced(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
         self._scales = np.empty(4)
         self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
@@ -131,7 +134,7 @@ class Compensator:
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
             ahead = self.lag_s if predicted else 0.0
-            self._low_pass = low_pass_coefficients(dt, cutoff_hz, ahead)
+            self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
         self._largest = np.concatenate(
             [np.minimum(_MAX_READING_VALUES[:6], 2.0 * self._range), _MAX_READING_VALUES[6:]]
@@ -152,7 +155,7 @@ class Compensator:
         clip_wrenches(
             self._contact_and_scaled_wrench(np.zeros(NUM_READING_VALUES), np.zeros(3)), self._range
         )
-        self._evaluate_tare()
+        self._tare_problem_step_and_offsets()
         self._reset_filters()
         self.good_readings_in_row = 0
 
@@ -179,7 +182,7 @@ class Compensator:
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
-            raise weight_scale_error("load")
+            raise weight_scale_without_effect_error("load")
         set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:
@@ -217,7 +220,7 @@ class Compensator:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_readings_in_row < len(self._tare_rows):
             return f"refused: fewer than {TARE_REST_S:g} s of good readings so far"
-        problem, step, offsets = self._evaluate_tare()
+        problem, step, offsets = self._tare_problem_step_and_offsets()
         if problem == TARE_IN_MOTION:
             return "refused: the sensor moves"
         if problem == TARE_WRENCH_VARIES:
@@ -236,7 +239,7 @@ class Compensator:
         self.good_readings_in_row = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
-    def _evaluate_tare(self) -> tuple[int, Array, Array]:
+    def _tare_problem_step_and_offsets(self) -> tuple[int, Array, Array]:
         (mean, squares), offsets = np.zeros((2, NUM_READING_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)

@@ -12,13 +12,13 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.aligned_log import missing_orientation_error
+from drake_teleop.logs.aligned_log import removed_weight_needs_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
     ArmKinematics,
     PoseSourceFromJoints,
     ReadingAssembler,
-    ReadingStreams,
+    WrenchAndMotionStreams,
     pose_from_rpy,
 )
 from drake_teleop.robots.lines import JsonLineSink, JsonLineSource, TableSink
@@ -60,10 +60,10 @@ def open_source(
         return ReplayLogSource(path, load, cutoff_hz=cutoff_hz, delay=delay, real_time=real_time)
     source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
     weight_removed = load is not None and load.weight_removed
-    if not isinstance(source, ReadingStreams):
+    if not isinstance(source, WrenchAndMotionStreams):
         if weight_removed:
             source.close()
-            raise missing_orientation_error(address)
+            raise removed_weight_needs_orientation_error(address)
         return source
     track = load if isinstance(delay, str) else None
     if isinstance(delay, str):
@@ -95,7 +95,7 @@ def open_source_and_recorder(
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_SOURCE_RATE_HZ
     source = _open_streams(address, rate_hz, motion, sensor_pose, arm)
-    two_clocks = isinstance(source, ReadingStreams) and source.two_clocks
+    two_clocks = isinstance(source, WrenchAndMotionStreams) and source.two_clocks
     X_FS = _pose_from_option(sensor_pose)
     return source, Recorder(source.streams, largest, X_FS, two_clocks=two_clocks)
 
@@ -168,7 +168,7 @@ def _open_streams(
                     remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
                 )
             opened[-1] = PoseSourceFromJoints(opened[-1], arm)
-        return ReadingStreams(*opened, where=motion or address)
+        return WrenchAndMotionStreams(*opened, where=motion or address)
     except BaseException:
         for each in opened:
             each.close()

@@ -16,7 +16,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Reading, ReadingFlag, Source
+from drake_teleop.robots.streams import DAMAGED_WRENCH_READING, WRENCH, Reading, ReadingFlag, Source
 
 DEFAULT_UDP_PORT = 49152
 REQUEST_FORMAT = struct.Struct(">HHI")
@@ -74,7 +74,7 @@ class NetFtSource(Source):
     def reading_of_packet(self, packet: bytes, now: float) -> Reading:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         if len(packet) != RECORD_FORMAT.size:
-            return DAMAGED_WRENCH
+            return DAMAGED_WRENCH_READING
         rdt_sequence, ft_sequence, status, *counts = RECORD_FORMAT.unpack(packet)
         # rdt_sequence has 32 bits and wraps around.
         self._number += (rdt_sequence - self._number + 2**31) % 2**32 - 2**31

@@ -27,7 +27,7 @@ from drake_teleop.robots.streams import (
     ReadingFlag,
 )
 
-_INVALID_FLAGS = (
+_UNRECORDED_READING_FLAGS = (
     ReadingFlag.DAMAGED
     | ReadingFlag.NOT_FINITE
     | ReadingFlag.OUT_OF_RANGE
@@ -94,7 +94,7 @@ class Recorder:
         if stream not in self._part:
             return
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        valid = finite and not reading.flags & _INVALID_FLAGS
+        valid = finite and not reading.flags & _UNRECORDED_READING_FLAGS
         if stream == POSE:
             valid &= abs(float(np.linalg.norm(values[:4])) - 1.0) < _QUATERNION_NORM_TOLERANCE
         elif stream in (WRENCH, WRENCH_AND_MOTION):

@@ -11,8 +11,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import replace_specific_force_by_acceleration
-from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import choose_delay, far_from_gaps, remove_delay
+from drake_teleop.logs.processing import phi_with_inertia_replaced
+from drake_teleop.logs.read.alignment import choose_delay, is_far_from_gaps, remove_delay
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
@@ -44,7 +44,9 @@ class ReplayLogSource(Source):
         delay_s = 0.0
         if load is not None:
             log = replace_specific_force_by_acceleration(log) if load.weight_removed else log
-            delay_s, source = choose_delay(log, cutoff_hz, delay, usable_phi(load)[0])
+            delay_s, source = choose_delay(
+                log, cutoff_hz, delay, phi_with_inertia_replaced(load)[0]
+            )
             if source == "undetermined":
                 delay_s = load.delay_s
             log = remove_delay(log, delay_s)
@@ -52,7 +54,7 @@ class ReplayLogSource(Source):
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
         self._gravity = log.gravity
-        self._flags = np.where(far_from_gaps(log, cutoff_hz), 0, int(ReadingFlag.GAP))
+        self._flags = np.where(is_far_from_gaps(log, cutoff_hz), 0, int(ReadingFlag.GAP))
         self._at, self._chunk, self._start = 0, chunk, math.nan
 
     def read(self, timeout_s: float) -> list[Reading] | None:

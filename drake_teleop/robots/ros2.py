@@ -19,9 +19,9 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
+    checked_topic_name,
     damaged_reading_of_topic,
     domain_of_address,
-    topic_of_address,
     topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import (
@@ -109,7 +109,8 @@ class Ros2Source(Source):
         self._counts: Counter[str] = Counter()
         self._node, self._next_spin = shared_node(domain), 0.0
         self._subscriptions = [
-            self._subscribe(name, classes[name], topic) for name, topic in topics.items()
+            self._subscribe_and_get_receiver(name, classes[name], topic)
+            for name, topic in topics.items()
         ]
 
     @delayed_signals()
@@ -152,7 +153,9 @@ class Ros2Source(Source):
 
         return receive
 
-    def _subscribe(self, name: str, kind: Any, topic: str) -> tuple[Any, Callable[..., None]]:
+    def _subscribe_and_get_receiver(
+        self, name: str, kind: Any, topic: str
+    ) -> tuple[Any, Callable[..., None]]:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
         node, receive = self._node.node, self._make_receiver(name, kind)
@@ -174,7 +177,7 @@ class Ros2Sink:
         parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
-        topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
+        topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
         self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]

@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import quaternion_product, rotate_vector
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Reading
+from drake_teleop.robots.streams import DAMAGED_WRENCH_READING, IMU, JOINTS, POSE, WRENCH, Reading
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 MESSAGE_TYPE_OF_TOPIC = {
@@ -37,7 +37,7 @@ def domain_of_address(address: Address) -> int:
     return int(text)
 
 
-def topic_of_address(address: Address, text: str) -> str:
+def checked_topic_name(address: Address, text: str) -> str:
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
@@ -52,10 +52,10 @@ def topics_frames_and_streams(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
     """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
-    topics = {WRENCH: topic_of_address(address, address.path)}
+    topics = {WRENCH: checked_topic_name(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.optional_parameter(stream)) is not None:
-            topics[stream] = topic_of_address(address, text)
+            topics[stream] = checked_topic_name(address, text)
     frames: tuple[str, ...] = ()
     if (text := address.optional_parameter("tf")) is not None:
         frames, topics["tf"] = tuple(text.split(",")), "tf"
@@ -75,7 +75,7 @@ def topics_frames_and_streams(
 
 
 def damaged_reading_of_topic(name: str) -> Reading:
-    return DAMAGED_WRENCH._replace(stream=_STREAM_OF_TOPIC.get(name, name))
+    return DAMAGED_WRENCH_READING._replace(stream=_STREAM_OF_TOPIC.get(name, name))
 
 
 class MessageConverter:

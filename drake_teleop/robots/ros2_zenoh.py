@@ -19,9 +19,9 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
+    checked_topic_name,
     damaged_reading_of_topic,
     domain_of_address,
-    topic_of_address,
     topics_frames_and_streams,
 )
 from drake_teleop.robots.streams import CompensatedWrench, Reading, Source
@@ -185,7 +185,7 @@ class ZenohSink:
 
     def __init__(self, address: str) -> None:
         parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=("frame", "wrench", "domain"))
-        domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
+        domain, topic = domain_of_address(parsed), checked_topic_name(parsed, parsed.path)
         which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which

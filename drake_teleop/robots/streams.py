@@ -78,7 +78,7 @@ class CompensatedWrench(NamedTuple):
 
 DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_READING_VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
-DAMAGED_WRENCH = DAMAGED_READING._replace(values=np.full(6, np.nan), stream=WRENCH)
+DAMAGED_WRENCH_READING = DAMAGED_READING._replace(values=np.full(6, np.nan), stream=WRENCH)
 """Reading for invalid packets with a wrench alone."""
 
 

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
     DAMAGED_READING,
-    DAMAGED_WRENCH,
+    DAMAGED_WRENCH_READING,
     POSE,
     WRENCH,
     CompensatedWrench,
@@ -55,7 +55,7 @@ def pack_wrench_and_pose(wrench: Reading, pose: Reading) -> bytes:
 
 def unpack_wrench_and_pose(packet: bytes) -> list[Reading]:
     if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
-        return [DAMAGED_WRENCH]
+        return [DAMAGED_WRENCH_READING]
     _, flags, number, t = _PACKET_HEADER.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _PACKET_HEADER.size).astype(np.float64)
     wrench = Reading(number, t, values[:6], flags & _SATURATED_FLAG, stream=WRENCH)

@@ -11,12 +11,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.detection import (
-    MAX_NOISE_LEVEL,
+    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
     ContactDetector,
     fit_noise_floor,
     update_contact_flag,
 )
-from drake_teleop.load.contact.noise_floor import limit_covariance
+from drake_teleop.load.contact.noise_floor import limit_covariance_to_scales
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.watched import (
@@ -27,8 +27,8 @@ from drake_teleop.load.online.watched import (
     monitor_load,
 )
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import causal_low_pass, low_pass_coefficients
-from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.causal import causal_low_pass, low_pass_and_settled_state
+from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
@@ -37,7 +37,9 @@ LOAD_WRENCH_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_LOAD_REPLACEMENT_ACCURACY = 1e-12  # accuracy at which another load would replace the present one
+_MASS_STD_RATIO_TO_REPLACE_LOAD = (
+    1e-12  # accuracy at which another load would replace the present one
+)
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
@@ -63,10 +65,10 @@ class ContactAndLoadMonitor:
             np.zeros(9),
             dt,
             relative_wrench_error=LOAD_WRENCH_ERROR_FRACTION,
-            mass_std_ratio=_LOAD_REPLACEMENT_ACCURACY,
+            mass_std_ratio=_MASS_STD_RATIO_TO_REPLACE_LOAD,
         )
-        self._phi = usable_phi(load)[0]
-        self._covariance = limit_covariance(self._phi, load.covariance)
+        self._phi = phi_with_inertia_replaced(load)[0]
+        self._covariance = limit_covariance_to_scales(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt
         self.restart(load.offsets)
         self.reading_flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
@@ -114,11 +116,14 @@ class StreamContactDetector:
                 remedy="use the log that `calibrate` wrote from this stream",
             )
         self._fast, self._slow = (
-            low_pass_coefficients(dt, hz) for hz in (cutoff_hz, _GRAVITY_CUTOFF_HZ)
+            low_pass_and_settled_state(dt, hz) for hz in (cutoff_hz, _GRAVITY_CUTOFF_HZ)
         )
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
-        phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
+        phi, (s, omega, alpha) = (
+            phi_with_inertia_replaced(load)[0],
+            np.split(values[:, 6:], 3, axis=1),
+        )
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
@@ -128,10 +133,10 @@ class StreamContactDetector:
         settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
-        covariance = limit_covariance(phi, load.covariance, tared=True)
+        covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_CONTACT_STATISTIC))
+        threshold = max(NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC))
         self._settings = ContactDetector(
             floor,
             threshold,

@@ -52,10 +52,12 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             builder.ExportOutput(wire.get_output_port(), exit_)
         return builder.Build()
     scaling = scenario.kinematic_scaling
-    passivity = _adapt_passivity_to_device(scenario, passivity_with_arm_mass(scenario))
+    passivity = _add_device_limits_and_encoder_steps(
+        scenario, passivity_with_arm_mass_and_servo(scenario)
+    )
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     motion_scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    scales = motion_scales, _contact_force_scale(scenario)
+    scales = motion_scales, _rendered_over_contact_force(scenario)
     start, period = start_pose(scenario.slave), 1 / scenario.rates.hand_hz
     seed = scenario.simulation.seed
     block = TeleopChannel(scenario.channel, passivity, R_WB, *scales, start, period, seed)
@@ -71,7 +73,9 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _adapt_passivity_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _add_device_limits_and_encoder_steps(
+    scenario: Scenario, passivity: PassivityConfig
+) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:
@@ -85,7 +89,7 @@ def _adapt_passivity_to_device(scenario: Scenario, passivity: PassivityConfig) -
     )
 
 
-def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
+def passivity_with_arm_mass_and_servo(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's passivity settings, with mass and servo of the arm if needed.
 
     An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
@@ -110,10 +114,10 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def slave_wrench_power_scale(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return _contact_force_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _rendered_over_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _contact_force_scale(scenario: Scenario) -> float:
+def _rendered_over_contact_force(scenario: Scenario) -> float:
     """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

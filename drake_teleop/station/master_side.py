@@ -83,7 +83,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         builder.AddNamedSystem("encoders", encoders)
         builder.Connect(device.GetOutputPort("state"), encoders.get_input_port())
         read = encoders.get_output_port()
-    own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
+    own_period = scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
     if own_period is not None:
         held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
         held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))

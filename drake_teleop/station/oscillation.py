@@ -19,7 +19,7 @@ Flags = NDArray[np.bool_]
 _MIN_SWING_M, _MIN_SWING_RAD = 5e-4, np.deg2rad(0.5)
 MAX_REVERSAL_DELAY_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
-MAX_FORCE_RIPPLE_AT_REST_N = 0.05
+MAX_FORCE_RIPPLE_RMS_AT_REST_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_OSCILLATION_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
@@ -68,7 +68,7 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_times_near_causes(t[reversal_indices(x, swing)], commanded, near)
+        times = remove_nearest_time_of_each_cause(t[reversal_indices(x, swing)], commanded, near)
         for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
@@ -82,7 +82,9 @@ def flag_unexplained_pose_oscillation(
 
     `near` [s] is that of `flag_unexplained_oscillation`.
     """
-    turned, wanted = (quaternions_as_angles(pose, command) for pose in (actual, command))
+    turned, wanted = (
+        doubled_quaternions_with_reference_sign(pose, command) for pose in (actual, command)
+    )
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, near)
     return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_SWING_RAD, near)
 
@@ -90,11 +92,14 @@ def flag_unexplained_pose_oscillation(
 def pose_reversal_times(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
     rows = [reversal_indices(x, _MIN_SWING_M) for x in pose[:, 4:].T]
-    rows += [reversal_indices(x, _MIN_SWING_RAD) for x in quaternions_as_angles(pose, pose).T]
+    rows += [
+        reversal_indices(x, _MIN_SWING_RAD)
+        for x in doubled_quaternions_with_reference_sign(pose, pose).T
+    ]
     return np.sort(t[np.concatenate(rows)])
 
 
-def quaternions_as_angles(pose: Array, reference: Array) -> Array:
+def doubled_quaternions_with_reference_sign(pose: Array, reference: Array) -> Array:
     """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
     Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).
@@ -103,7 +108,7 @@ def quaternions_as_angles(pose: Array, reference: Array) -> Array:
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_times_near_causes(times: Array, causes: Array, near: float) -> Array:
+def remove_nearest_time_of_each_cause(times: Array, causes: Array, near: float) -> Array:
     """Remove, for each cause, the nearest event within `near` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -155,7 +160,9 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
         force: (N,) magnitude of the contact force [N].
         reversals: times of the command's reversals [s].
     """
-    touches = remove_times_near_causes(_find_touches(t, force), reversals, _MAX_TOUCH_TO_REVERSAL_S)
+    touches = remove_nearest_time_of_each_cause(
+        _find_touches(t, force), reversals, _MAX_TOUCH_TO_REVERSAL_S
+    )
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_CHATTER_TOUCHES or series[-1] - series[0] < _MIN_CHATTER_DURATION_S:

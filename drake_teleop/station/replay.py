@@ -16,7 +16,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import check_inputs_are_kept, models_dir, output_folder, write_json
+from drake_teleop.common.files import (
+    refuse_to_replace_inputs,
+    models_dir,
+    output_folder,
+    write_json,
+)
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
@@ -35,11 +40,15 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import (
+    NominalSlave,
+    ParseSlave,
+    finalize_without_limit_warnings,
+)
 from drake_teleop.station.slave.surroundings import (
     AddedEnvironment,
     AddEnvironment,
-    MovingBodies,
+    MovingBodiesExceptLeaf,
     joint_positions_of_pose,
 )
 
@@ -78,7 +87,7 @@ def replay_command(
     """
     logs = _find_logs(run)
     for folder in {run, *(log.parent for log in logs)}:
-        check_inputs_are_kept(out / "summary.json", folder / "summary.json")
+        refuse_to_replace_inputs(out / "summary.json", folder / "summary.json")
     films = []
     with output_folder(out):
         for log in logs:
@@ -204,14 +213,14 @@ class ReplayScene:
         self._master = None
         if "master_state" in recorded:
             self._master = _add_haptic_device(self.plant, scenario)
-        finalize_plant(self.plant)
+        finalize_without_limit_warnings(self.plant)
         self._moving_bodies = {
             MOVING_BODY_POSE_PREFIX + k: body
-            for k, body in MovingBodies(self.plant, touched).items()
+            for k, body in MovingBodiesExceptLeaf(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
-        self._bodies = dict(self._add_bodies(meshcat))
-        _draw_floor_and_tables(meshcat, scenario, with_table=self._master is not None)
+        self._bodies = dict(self._draw_bodies_and_yield_moving_ones(meshcat))
+        _draw_room_and_set_camera(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
@@ -223,7 +232,9 @@ class ReplayScene:
             for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
         ]
 
-    def _add_bodies(self, meshcat: Meshcat) -> Iterator[tuple[str, RigidBody]]:
+    def _draw_bodies_and_yield_moving_ones(
+        self, meshcat: Meshcat
+    ) -> Iterator[tuple[str, RigidBody]]:
         plant, inspector = self.plant, self._shapes.model_inspector()
         for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
             path = f"/station/{int(body.index())}_{body.name()}"
@@ -251,7 +262,7 @@ class ReplayScene:
             self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), replay_time)
         if not self._arrows:
             return
-        forces, places = self._contact_forces_W(signals, sample), self._arrow_positions_W()
+        forces, places = self._arrow_forces_W(signals, sample), self._arrow_positions_W()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
@@ -268,7 +279,7 @@ class ReplayScene:
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
-    def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
+    def _arrow_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
@@ -315,7 +326,7 @@ def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevi
     return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
 
 
-def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     def draw_box(
         name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba
     ):

@@ -42,7 +42,7 @@ _DEFAULT_SHAPE_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
 _HALF_TURN_ABOUT_X = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
 _SECURITY_POLICY_TAG = '<meta http-equiv="Content-Security-Policy" content="{}">'
-_PAGE_TITLE_TAG = (
+_VIEWPORT_AND_TITLE_TAGS = (
     '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
 )
 
@@ -128,7 +128,7 @@ class ReplayFile:
         with silence_drake_log():  # no client connects to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
-        interval = self._duration_s / (len(self.times) - 1)
+        interval = self._recorded_time_span_s / (len(self.times) - 1)
         meshcat.StartRecording(1 / interval, set_visualizations_while_recording=False)
         for frame in range(len(self.times)):
             # Meshcat counts whole intervals: 29 x 0.02 rounds to less than 29 of them.
@@ -138,7 +138,7 @@ class ReplayFile:
         return meshcat.StaticHtml()
 
     @property
-    def _duration_s(self) -> float:
+    def _recorded_time_span_s(self) -> float:
         return max(float(self.times[-1] - self.times[0]), 1e-3)
 
     def _add_player(self, page: str) -> str:
@@ -146,7 +146,7 @@ class ReplayFile:
         film = {
             "title": self.title,
             "start": start,
-            "span": self._duration_s,
+            "span": self._recorded_time_span_s,
             "frames": len(self.times),
             "slow_motion": self.slow_motion,
             "readings": [reading.data_for_page() for reading in self.displayed_numbers],
@@ -157,7 +157,12 @@ class ReplayFile:
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        whole = head.replace("<title>Drake MeshCat<", _PAGE_TITLE_TAG, 1) + player + body + tail
+        whole = (
+            head.replace("<title>Drake MeshCat<", _VIEWPORT_AND_TITLE_TAGS, 1)
+            + player
+            + body
+            + tail
+        )
         return whole.replace(
             "<title>", _SECURITY_POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
         )

@@ -16,7 +16,7 @@ import numpy as np
 from drake_teleop.common.errors import (
     DrakeTeleopError,
     expect_type,
-    refuse_fork,
+    refuse_polars_in_forked_process,
     remedy_to_install_extra,
     wrap_read_errors,
 )
@@ -379,7 +379,7 @@ def _files_of_log(path: Path) -> list[Path]:
 def _read_columns(path: Path, columns: list[str]) -> Array:
     import polars as pl
 
-    refuse_fork()
+    refuse_polars_in_forked_process()
     table = pl.read_parquet(_files_of_log(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"columns {', '.join(columns)} do not contain numbers")

@@ -9,30 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.numeric import Array, contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import passivity_with_arm_mass, slave_wrench_power_scale
+from drake_teleop.station.channel_side import (
+    passivity_with_arm_mass_and_servo,
+    slave_wrench_power_scale,
+)
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
-    MAX_FORCE_RIPPLE_AT_REST_N,
+    MAX_FORCE_RIPPLE_RMS_AT_REST_N,
     MAX_REVERSAL_DELAY_S,
     dominant_frequency,
+    doubled_quaternions_with_reference_sign,
     find_chatter,
     flag_unexplained_oscillation,
     flag_unexplained_pose_oscillation,
     high_pass_above_5_hz,
     pose_reversal_times,
-    quaternions_as_angles,
 )
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
-from drake_teleop.station.slave.posture_shapes import start_overlaps
+from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
@@ -74,19 +77,19 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_faults(result),
         _check_limits(result, scenario, arm),
         _check_channel(result, scenario),
-        _check_joint_tracking(result, scenario, arm),
+        _check_joint_tracking_and_oscillation(result, scenario, arm),
         _check_hand_oscillation(result),
         _check_contact_chatter(result),
-        _check_rendered_force(result),
+        _check_rendered_force_oscillation(result),
     )
-    overlaps, _ = start_overlaps(scenario.slave, scenario.surroundings)
+    overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
     return [
         *overlaps,
         *(f"{condition} {_spans_text(spans)}" for condition, spans in found if spans),
     ]
 
 
-def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
+def find_spans_closing_gaps(t: Array, happened: Flags, least: float = 0.0) -> Spans:
     """Return the time spans (start, stop) [s] during which `happened` (N,) is true.
 
     Gaps below 50 ms are closed; then spans shorter than `least` [s] are dropped.
@@ -118,20 +121,23 @@ def _check_faults(result: SimulationResult) -> Warnings:
         slave = result["fault"][:, 0]
     if "fault_at_hand" in result:
         hand = result["fault_at_hand"][:, 0]
-    for fault, meaning in FAULT_MEANINGS.items():
+    for fault, meaning in FAULT_WARNINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
-            yield f"a fault: {meaning},", find_spans(t, happened)
+            yield f"a fault: {meaning},", find_spans_closing_gaps(t, happened)
 
 
 def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t = result.t
     flag = result["saturated"][:, 0]
-    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
+    yield (
+        "the wrist sensor saturates",
+        find_spans_closing_gaps(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG)),
+    )
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
-            yield f"inverse kinematics: {status.name}", find_spans(t, happened)
+            yield f"inverse kinematics: {status.name}", find_spans_closing_gaps(t, happened)
     control = scenario.joint_control
     asked = control.position_loop_gain_per_s * _joint_tracking_error(result)
     fastest = arm.velocity_limit
@@ -143,25 +149,28 @@ def _check_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -
     ):
         clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
-            yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
+            yield (
+                f"joint {joint + 1} is at its largest {what}",
+                find_spans_closing_gaps(t, clipped[:, joint]),
+            )
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
         if isinstance(device, LeaderDevice):
             full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
             joints = result["master_state"][:, : device.num_joints]
-            full |= device.is_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
+            full |= device.is_any_motor_at_limit(joints, shown, _SHARE_AT_MOTOR_LIMIT)
         elif device.peak_torque.all():
-            full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
-        spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
+            full |= _is_displayed_torque_at_limit(shown[:, 3:], result["master_state"], device)
+        spans = find_spans_closing_gaps(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans
-        ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
-        yield "the device is at the end of its workspace", find_spans(t, ended)
+        ended = device.is_any_axis_at_end_stop(result["master_state"][:, : device.num_joints])
+        yield "the device is at the end of its workspace", find_spans_closing_gaps(t, ended)
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
         bent = scenario.first_sheet_spring.max_linear_deflection
         yield (
             f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
-            find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
+            find_spans_closing_gaps(t, np.abs(result["sheet_state"][:, 0]) > bent),
         )
 
 
@@ -170,7 +179,9 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
         return
     t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
-        spans = find_spans(t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S)
+        spans = find_spans_closing_gaps(
+            t, result[f"ports.{end}_silent"] > timeout, _MIN_WARNING_SPAN_S
+        )
         yield f"the {end}'s end is in its safe state, no packets arrive from the {other},", spans
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
@@ -178,7 +189,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for command, actual, least, unit, scale in _pose_parts_with_lag_limits(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
-        spans = find_spans(t, lag > least, _MIN_WARNING_SPAN_S)
+        spans = find_spans_closing_gaps(t, lag > least, _MIN_WARNING_SPAN_S)
         largest = _maximum_within_spans(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
@@ -189,7 +200,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Warnings:
     oscillating = flag_unexplained_pose_oscillation(
         t, sent, received, MAX_REVERSAL_DELAY_S + window
     )
-    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
+    spans = find_spans_closing_gaps(t, oscillating, _MIN_WARNING_SPAN_S)
     yield f"the channel ({by}) makes the slave's command oscillate", spans
 
 
@@ -199,7 +210,7 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass)
+    mass = np.array(passivity_with_arm_mass_and_servo(scenario).slave_mass)
     limit = speed_limit(config, mass * slave_wrench_power_scale(scenario))
     then = t - _newest_packet_ages_s(t, scenario)
     window = (
@@ -224,14 +235,16 @@ def _check_reserve_speed_limit(result: SimulationResult, scenario: Scenario) -> 
             " pose (move more slowly, or increase the energy:"
             f" passivity.{scenario.passivity.method}.reserve"
             f" {_format_list(enough)} and initial {_format_list(enough + config.hand_reserve)}),",
-            find_spans(t, held),
+            find_spans_closing_gaps(t, held),
         )
 
 
 def _pose_parts_with_lag_limits(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    wanted, turned = (quaternions_as_angles(pose, command) for pose in (command, actual))
+    wanted, turned = (
+        doubled_quaternions_with_reference_sign(pose, command) for pose in (command, actual)
+    )
     return (
         (command[:, 4:], actual[:, 4:], _MIN_COMMAND_LAG_M, "mm", 1e3),
         (wanted, turned, _MIN_COMMAND_LAG_RAD, "degrees", _DEGREES_PER_RAD),
@@ -249,7 +262,9 @@ def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
+def _check_joint_tracking_and_oscillation(
+    result: SimulationResult, scenario: Scenario, arm: ArmModel
+) -> Warnings:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
@@ -259,14 +274,14 @@ def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: Arm
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
-        spans = find_spans(
+        spans = find_spans_closing_gaps(
             t, far > (_MIN_COMMAND_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_WARNING_SPAN_S
         )
         largest = _maximum_within_spans(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
     oscillating = flag_unexplained_oscillation(t, command, actual, _MIN_JOINT_OSCILLATION_RAD)
-    spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
+    spans = find_spans_closing_gaps(t, oscillating, _MIN_WARNING_SPAN_S)
     yield "the slave oscillates while its command does not,", spans
 
 
@@ -275,7 +290,7 @@ def _check_hand_oscillation(result: SimulationResult) -> Warnings:
         oscillating = flag_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], MAX_REVERSAL_DELAY_S
         )
-        spans = find_spans(result.t, oscillating, _MIN_WARNING_SPAN_S)
+        spans = find_spans_closing_gaps(result.t, oscillating, _MIN_WARNING_SPAN_S)
         yield "the hand oscillates while its intent does not,", spans
 
 
@@ -296,7 +311,7 @@ def _check_contact_chatter(result: SimulationResult) -> Warnings:
         )
 
 
-def _check_rendered_force(result: SimulationResult) -> Warnings:
+def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     if not {"intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
@@ -306,7 +321,9 @@ def _check_rendered_force(result: SimulationResult) -> Warnings:
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_INTENT_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_FORCE_RIPPLE_AT_REST_N), _MIN_WARNING_SPAN_S)
+    spans = find_spans_closing_gaps(
+        t, rests & (rms > MAX_FORCE_RIPPLE_RMS_AT_REST_N), _MIN_WARNING_SPAN_S
+    )
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
@@ -335,7 +352,9 @@ def _joint_tracking_error(result: SimulationResult) -> Array:
     return command - result["slave_state"][:, : command.shape[1]]
 
 
-def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
+def _is_displayed_torque_at_limit(
+    torque: Array, master_state: Array, device: HapticDevice
+) -> Flags:
     full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):

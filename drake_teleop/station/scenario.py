@@ -11,9 +11,9 @@ from typing import Any, TypeVar, cast
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.config import (
+    check_all_field_values,
     check_field,
     check_field_name,
-    check_ranges,
     check_structure,
     choice,
     plain,
@@ -36,7 +36,7 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import FIGURES, Master
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import check_distance
+from drake_teleop.station.operator.task import check_target_beyond_standoff
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
@@ -58,7 +58,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
 _MAX_CONTACT_STEP_S = 1.25e-4
-_MIN_SCALE_WITH_METHOD = 1e-4  # 0.1 um at the slave for 1 mm at the hand
+_MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
 @settings
@@ -158,7 +158,7 @@ class Scenario:
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
-        check_ranges(self, where)
+        check_all_field_values(self, where)
         self.operator.check(f"{where}:operator")
         self.passivity.check(f"{where}:passivity")
         self.force_scaling.scales(f"{where}:force_scaling")
@@ -219,7 +219,9 @@ def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path
     return path
 
 
-def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
+def settings_without_range_check(
+    schema: type[_T], data: Any, where: str, defaults: _T | None = None
+) -> _T:
     """Return settings from parsed YAML data, with unchecked ranges; `where` begins messages."""
     check_structure(schema, data, where)
     data = dict(data)
@@ -249,7 +251,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     if control.get("interface") is not None:
         interface = POSITION_INTERFACES.get(str(control.get("servo")))
         defaults.joint_control.interface = copy.deepcopy(interface)
-    scenario = settings_from_data(Scenario, data, where, defaults)
+    scenario = settings_without_range_check(Scenario, data, where, defaults)
     scenario.check(where)
     absolute: Scenario = with_absolute_paths(scenario, Path(where).parent)
     return absolute
@@ -299,7 +301,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 def _check_task(scenario: Scenario, where: str) -> None:
     if scenario.operator.task is None:
         return
-    check_distance(scenario.operator.task, f"{where}:operator.task")
+    check_target_beyond_standoff(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
             "the scale is 0, but the operator's task requires motion of the slave (above 0)",
@@ -335,7 +337,8 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         raise DrakeTeleopError(what, where=f"{where}:master.leader.leads", remedy=remedy)
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
-    if scenario.passivity.method != "none" and min(scales) < _MIN_SCALE_WITH_METHOD:
-        what = f"passivity methods require kinematic scales of {_MIN_SCALE_WITH_METHOD:g} or more"
+    if scenario.passivity.method != "none" and min(scales) < _MIN_KINEMATIC_SCALE_WITH_PASSIVITY:
+        least = _MIN_KINEMATIC_SCALE_WITH_PASSIVITY
+        what = f"passivity methods require kinematic scales of {least:g} or more"
         remedy = "increase both scales of kinematic_scaling, or set method: none"
         raise DrakeTeleopError(what, where=f"{where}:passivity.method", remedy=remedy)

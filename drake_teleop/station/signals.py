@@ -16,25 +16,25 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
 #: Prefix of the pose signals of moving bodies of the surroundings.
 MOVING_BODY_POSE_PREFIX = "pose_of_"
 
-_WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
-_POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
-_TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
-_LOAD = (
+_WRENCH_COMPONENTS = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
+_POSE_COMPONENTS = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
+_TWIST_COMPONENTS = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
+_LOAD_ESTIMATE_COMPONENTS = (
     "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",
     "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
 )
-_PORTS = (
+_CHANNEL_PORT_COMPONENTS = (
     "hand hand_rotation slave slave_rotation master_silent slave_silent command command_rotation",
     "J,J,J,J,s,s,J,J",
 )
 
 
-def _joint_state_axes(joints: int) -> tuple[str, str]:
+def _joint_state_components(joints: int) -> tuple[str, str]:
     names = [f"{letter}_{i + 1}" for letter in "qv" for i in range(joints)]
     return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
 
 
-def _joint_axes(joints: int, unit: str) -> tuple[str, str]:
+def _joint_components(joints: int, unit: str) -> tuple[str, str]:
     return " ".join(f"joint_{i + 1}" for i in range(joints)), unit
 
 
@@ -45,7 +45,7 @@ _JOINT_SIGNAL_NAMES = ("joint_position", "joint_torque", "joint_command")
 SIGNALS = {
     name: _signal(name, components, units, description)
     for name, (components, units), description in (
-        ("measured_wrench_S", _WRENCH, "of the sensor, sign of Eq. (1), at sample_time"),
+        ("measured_wrench_S", _WRENCH_COMPONENTS, "of the sensor, sign of Eq. (1), at sample_time"),
         ("specific_force_S", ("s_x s_y s_z", "m/s^2"), "a - g at So, at sample_time"),
         ("angular_velocity_S", ("omega_x omega_y omega_z", "rad/s"), "of S, at sample_time"),
         ("angular_acceleration_S", ("alpha_x alpha_y alpha_z", "rad/s^2"), "of S, at sample_time"),
@@ -55,34 +55,42 @@ SIGNALS = {
             "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after"
             " a lost reading",
         ),
-        ("joint_position", _joint_axes(6, "rad"), "encoder readings of the slave, at sample_time"),
+        (
+            "joint_position",
+            _joint_components(6, "rad"),
+            "encoder readings of the slave, at sample_time",
+        ),
         (
             "sample_time",
             ("t", "s"),
             "time of the wrist sensor's sample in this row; other signals are of t",
         ),
-        ("load_estimate", _LOAD, "offsets and phi, Eq. (7)"),
-        ("slave_state", _joint_state_axes(6), "true joint angles and velocities, at t"),
-        ("joint_torque", _joint_axes(6, "N m"), "of the slave's motors"),
+        ("load_estimate", _LOAD_ESTIMATE_COMPONENTS, "offsets and phi, Eq. (7)"),
+        ("slave_state", _joint_state_components(6), "true joint angles and velocities, at t"),
+        ("joint_torque", _joint_components(6, "N m"), "of the slave's motors"),
         (
             "load_state",
             ("state", "1"),
             "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load",
         ),
-        ("true_contact_wrench_W", _WRENCH, "environment on the tool, about Wo, in W"),
+        ("true_contact_wrench_W", _WRENCH_COMPONENTS, "environment on the tool, about Wo, in W"),
         ("sheet_state", ("z v_z", "m,m/s"), "deflection of the sheet spring's end, upwards"),
-        ("intent", _POSE, "intended pose of the stylus, X_BE"),
-        ("hand_wrench_E", _WRENCH, "hand on the stylus at Eo, in B"),
-        ("master_state", _joint_state_axes(6), "joint angles and velocities of the device"),
-        ("pose_master", _POSE, "of the stylus, X_BE"),
-        ("twist_master", _TWIST, "of the stylus in the device's base"),
-        ("pose_command", _POSE, "setpoint of the slave, X_WS"),
-        ("joint_command", _joint_axes(6, "rad"), "from the inverse kinematics"),
+        ("intent", _POSE_COMPONENTS, "intended pose of the stylus, X_BE"),
+        ("hand_wrench_E", _WRENCH_COMPONENTS, "hand on the stylus at Eo, in B"),
+        ("master_state", _joint_state_components(6), "joint angles and velocities of the device"),
+        ("pose_master", _POSE_COMPONENTS, "of the stylus, X_BE"),
+        ("twist_master", _TWIST_COMPONENTS, "of the stylus in the device's base"),
+        ("pose_command", _POSE_COMPONENTS, "setpoint of the slave, X_WS"),
+        ("joint_command", _joint_components(6, "rad"), "from the inverse kinematics"),
         ("ik_status", ("status", "1"), "of the inverse kinematics (IkStatus), 0 = OK"),
-        ("scaled_wrench_S", _WRENCH, "F' of Fig. 2, before the scale to the master"),
-        ("contact_wrench_S", _WRENCH, "Eq. (13), calculated contact wrench"),
+        ("scaled_wrench_S", _WRENCH_COMPONENTS, "F' of Fig. 2, before the scale to the master"),
+        ("contact_wrench_S", _WRENCH_COMPONENTS, "Eq. (13), calculated contact wrench"),
         ("fault", ("fault", "1"), "of sample or load estimate, 0 = none"),
-        ("force_to_master", _WRENCH, "wrench that the device displays, within its limits"),
+        (
+            "force_to_master",
+            _WRENCH_COMPONENTS,
+            "wrench that the device displays, within its limits",
+        ),
         ("fault_at_hand", ("fault", "1"), "of the wrench command at the device, 0 = none"),
         (
             "task_state",
@@ -90,10 +98,10 @@ SIGNALS = {
             "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
             " smallest detected force at the hand; share of approach_speed (docs/operator.md)",
         ),
-        ("pose_received", _POSE, "setpoint X_WS of the slave after the channel"),
+        ("pose_received", _POSE_COMPONENTS, "setpoint X_WS of the slave after the channel"),
         (
             "ports",
-            _PORTS,
+            _CHANNEL_PORT_COMPONENTS,
             "energy into the channel at its ends, in the master's power units; time since the last"
             " packet at each end; energy of the slave's wrench along the command",
         ),
@@ -108,14 +116,14 @@ def signal_of(name: str, size: int) -> Signal:
     if name.startswith(MOVING_BODY_POSE_PREFIX):
         return _signal(
             name,
-            *_POSE,
+            *_POSE_COMPONENTS,
             f"where the body {name.removeprefix(MOVING_BODY_POSE_PREFIX)} is, in W, at t",
         )
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal
     if name in _JOINT_SIGNAL_NAMES:
-        return _signal(name, *_joint_axes(size, signal.units[0]), signal.description)
+        return _signal(name, *_joint_components(size, signal.units[0]), signal.description)
     if name in ("slave_state", "master_state"):
-        return _signal(name, *_joint_state_axes(size // 2), signal.description)
+        return _signal(name, *_joint_state_components(size // 2), signal.description)
     return signal

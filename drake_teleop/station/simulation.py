@@ -11,8 +11,8 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
-from drake_teleop.common.config import check_ranges
+from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
+from drake_teleop.common.config import check_all_field_values
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import remove_log
 from drake_teleop.common.progress import UpdateProgress, show_progress
@@ -56,7 +56,7 @@ def simulate(
     if simulation is None:
         raise DrakeTeleopError("is missing", where="simulation", remedy="pass scenario.simulation")
     expect_type(Simulation, simulation, "simulation", "pass scenario.simulation")
-    check_ranges(simulation, "simulation")
+    check_all_field_values(simulation, "simulation")
     expect_type((str, Path, type(None)), log, "log", "give a folder")
     if isinstance(progress, bool):
         with show_progress(progress, after=1.0) as stage:
@@ -104,7 +104,7 @@ def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
-            what = FAULT_MEANINGS[Fault(int(log.data()[column][0, k]))]
+            what = FAULT_WARNINGS[Fault(int(log.data()[column][0, k]))]
             raise DrakeTeleopError(
                 f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}",
                 where="simulation.on_fault",

@@ -29,12 +29,12 @@ from drake_teleop.station.slave.joint_commands import (
     ik_method_name,
 )
 from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
-from drake_teleop.station.slave.joint_friction import FRICTION_TANH_SPEED
+from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, servo_samples_per_event
 from drake_teleop.station.slave.surroundings import MovingBodyPose
-from drake_teleop.station.wiring import connect_inputs, connect_ports, export_outputs
+from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, export_outputs
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 SLAVE_MONITOR_PERIOD_S = 0.01
@@ -63,8 +63,8 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) 1 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`signals_of_sample`), slave_state, joint_torque, joint_command,
-          ik_status, scaled_wrench_S, fault: signals
+        - the parts of a sample (`signal_sizes_of_sample`), slave_state, joint_torque,
+          joint_command, ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
           sheet_state (with a sheet spring), pose_of_NAME (of each moving body of the
@@ -119,7 +119,7 @@ def MakeSlaveSide(
         export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
-    connect_inputs(builder, kinematics, body.slave.ports)
+    connect_matching_inputs(builder, kinematics, body.slave.ports)
     export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
         inputs = body.sample_ports | {
@@ -127,7 +127,7 @@ def MakeSlaveSide(
             "pose_slave": kinematics.GetOutputPort("pose_slave"),
             "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
         }
-        connect_inputs(builder, controller, inputs)
+        connect_matching_inputs(builder, controller, inputs)
 
     if scenario.contact_detection is not None:
         if noise_floor is None:
@@ -228,14 +228,14 @@ def _add_slave_blocks(
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
     _check_friction_time_step(slave, min(held, scenario.simulation.max_step))
-    connect_inputs(builder, control, ports)
+    connect_matching_inputs(builder, control, ports)
     names = [name for name in ("joint_torque", "torque_rate") if control.HasOutputPort(name)]
     torque = {name: control.GetOutputPort(name) for name in names}
     builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
     monitor = builder.AddNamedSystem("monitor", JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S))
-    connect_inputs(builder, monitor, ports)
+    connect_matching_inputs(builder, monitor, ports)
 
     motion, sensor_period = scenario.motion_estimation, 1 / rates.sensor_hz
     sample = AddCompiledWristSensor(builder, slave, sensor, motion, sensor_period, held, torque)
@@ -273,7 +273,7 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.joint_friction / FRICTION_TANH_SPEED)
+    slope = np.diag(slave.joint_friction / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
         shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
@@ -291,13 +291,13 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant) -> None:
     if slave.contact.drake_contact_reason:
         block = DrakeContact(slave.contact.tool_bodies, slave.contact.tool_shapes)
     contact = builder.AddNamedSystem("tool_contact", block)
-    connect_inputs(builder, contact, ports)
+    connect_matching_inputs(builder, contact, ports)
     export_outputs(builder, contact, "true_contact_wrench_W")
     if "sheet_state" in ports:
         builder.ExportOutput(ports["sheet_state"], "sheet_state")
     for name, body in slave.contact.moving_bodies.items():
         pose = builder.AddNamedSystem(MOVING_BODY_POSE_PREFIX + name, MovingBodyPose(plant, body))
-        connect_inputs(builder, pose, ports)
+        connect_matching_inputs(builder, pose, ports)
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 

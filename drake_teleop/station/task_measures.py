@@ -40,7 +40,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     begun = int(np.argmax(state[:, decision.PHASE_INDEX] != decision.PHASE_WAITING))
     span = slice(begun, ended + 1)
     done = state[ended, decision.OUTCOME_INDEX] > 0.0
-    force = contact_force(result)
+    force = true_contact_force_magnitudes(result)
     held = np.empty(0)
     if done and isinstance(task, Press):
         held = _contact_forces_during_hold(t, force, task, ended)
@@ -108,7 +108,7 @@ def _required_contact_force(task: Task) -> float:
     return task.push if isinstance(task, Insert) else 0.0
 
 
-def contact_force(result: SimulationResult) -> Array:
+def true_contact_force_magnitudes(result: SimulationResult) -> Array:
     """Return (N,) magnitude of the true contact force at the tool [N]; zeros without contact."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t))
@@ -134,7 +134,7 @@ def _contact_forces_during_hold(t: Array, force: Array, task: Press, ended: int)
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    force = contact_force(result)
+    force = true_contact_force_magnitudes(result)
     if isinstance(task, Press):
         held = float(_contact_forces_during_hold(result.t, force, task, ended).mean())
         if abs(held - task.force) <= task.tolerance:
@@ -165,7 +165,7 @@ def _force_and_position_text(
     wanted = (
         f" instead of {_required_contact_force(task):g} N" if _required_contact_force(task) else ""
     )
-    return f"{place}, {contact_force(result)[ended]:.1f} N at the tool{wanted}"
+    return f"{place}, {true_contact_force_magnitudes(result)[ended]:.1f} N at the tool{wanted}"
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:

@@ -9,12 +9,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, Syste
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.regressor import signals_of_sample
+from drake_teleop.load.regressor import signal_sizes_of_sample
 from drake_teleop.station.signals import LOG_BLOCK_NAME, MOVING_BODY_POSE_PREFIX, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
 COMBINED_PORTS = {
-    "sample": (*signals_of_sample(0), "sample_time"),
+    "sample": (*signal_sizes_of_sample(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
 }
@@ -47,7 +47,7 @@ def connect_ports(
     builder.Connect(output, port)
 
 
-def connect_inputs(
+def connect_matching_inputs(
     builder: DiagramBuilder, block: System, sources: Mapping[str, OutputPort]
 ) -> None:
     """Connect each output port to the input port of its name in `sources`, if the block has one."""

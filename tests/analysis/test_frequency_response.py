@@ -79,7 +79,7 @@ def test_friction_without_displayed_tool_changes_only_the_device():
 
 
 def test_multisine_has_odd_multiples_and_low_peak():
-    lines = EXCITATION.odd_multiples()
+    lines = EXCITATION.odd_multiples_of_base_rate()
     assert (lines % 2 == 1).all() and (np.diff(lines) > 0).all()
     direction = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     segments = EXCITATION.sines_along(direction, start=0.2)

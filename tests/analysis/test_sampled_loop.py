@@ -32,8 +32,8 @@ from drake_teleop.lab.analysis.period_map import (
     SLAVE_V,
     SLAVE_X,
     Sampling,
-    delay_in_hand_periods,
-    mass_spring_motion,
+    mass_spring_responses_to_unit_x_v_u,
+    one_way_delay_in_hand_periods,
     period_map_of_cut_loop,
     sampled_two_port,
 )
@@ -155,7 +155,7 @@ def test_two_port_tends_to_the_continuous_one_for_short_periods() -> None:
     ("delay", "steps"), [(0.0, 0), (1e-6, 1), (2e-4, 1), (7e-4, 1), (8e-4, 2), (1e-2, 20)]
 )
 def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: int) -> None:
-    assert delay_in_hand_periods(OneAxis(delay=delay), STATION) == steps
+    assert one_way_delay_in_hand_periods(OneAxis(delay=delay), STATION) == steps
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])
@@ -328,7 +328,7 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(
-        mass_spring_motion(w**2, 0.0, np.array([t])),
+        mass_spring_responses_to_unit_x_v_u(w**2, 0.0, np.array([t])),
         ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
         strict=True,
     ):

@@ -13,12 +13,12 @@ from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, s
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.channel_side import (
     MakeChannel,
-    _adapt_passivity_to_device,
+    _add_device_limits_and_encoder_steps,
     slave_wrench_power_scale,
 )
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.memory import LAST_WRENCH, LOAD_WRENCH
+from drake_teleop.station.passivity.memory import LAST_PORT_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
@@ -44,7 +44,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.peak_force, min(device.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _adapt_passivity_to_device(scenario, own)
+    limited = _add_device_limits_and_encoder_steps(scenario, own)
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -56,12 +56,14 @@ def test_ledger_has_the_encoder_steps_of_the_device():
     steps = {}
     for model in ("phantom_premium_15", "omega_6", "geomagic_touch"):
         scenario.master.model = model
-        steps[model] = _adapt_passivity_to_device(scenario, PassivityConfig()).ledger.encoder_step
+        steps[model] = _add_device_limits_and_encoder_steps(
+            scenario, PassivityConfig()
+        ).ledger.encoder_step
     assert steps["phantom_premium_15"] == [0.0, 0.0]
     np.testing.assert_allclose(steps["omega_6"], [1e-5, np.radians(0.09)])
     assert steps["geomagic_touch"][0] == pytest.approx(5.5e-5, rel=0.02)
     own = PassivityConfig(ledger=LedgerConfig(encoder_step=[2e-4, 1e-3]))
-    assert _adapt_passivity_to_device(scenario, own).ledger.encoder_step == [2e-4, 1e-3]
+    assert _add_device_limits_and_encoder_steps(scenario, own).ledger.encoder_step == [2e-4, 1e-3]
 
 
 @pytest.mark.parametrize(("gamma", "rendered"), [(0.5, 0.05), (0.0, 0.1)])
@@ -150,7 +152,7 @@ def test_load_wrench_is_transformed_as_the_wrench():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[SLAVE_METHOD_MEMORY][LAST_WRENCH]
+    held = ends[SLAVE_METHOD_MEMORY][LAST_PORT_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
     np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 

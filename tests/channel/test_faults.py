@@ -14,7 +14,7 @@ from drake_teleop.station.channel.channel import (
     step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import LAST_WRENCH, SERVO_D, SERVO_K
+from drake_teleop.station.passivity.memory import LAST_PORT_WRENCH, SERVO_D, SERVO_K
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -89,7 +89,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[SERVO_K][0] * (received[4] - slave[4]) - p[SERVO_D][0] * velocity
-        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][LAST_WRENCH][0]
+        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][LAST_PORT_WRENCH][0]
     return found
 
 

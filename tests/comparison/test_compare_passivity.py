@@ -29,13 +29,15 @@ pytestmark = pytest.mark.long
 @pytest.mark.pictures
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALL_STIFFNESSES_N_M", (5100.0,))
-    monkeypatch.setattr(study, "NETWORK_IMPAIRMENTS", ((0.0, 0.0),))
+    monkeypatch.setattr(study, "JITTER_AND_LOSS_PAIRS", ((0.0, 0.0),))
     monkeypatch.setattr(
         study, "LEAF_THICKNESSES_M", {"contact": study.LEAF_THICKNESSES_M["contact"]}
     )
     monkeypatch.setattr(study, "ROUND_TRIPS_S", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
-        study, "_INJECTED_ENERGY_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
+        study,
+        "_SIGMA_ROUND_TRIP_WALL_CASES",
+        tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))),
     )
     # Use the load of the shipped scenario, which other tests have identified.
     task = Task(

@@ -51,7 +51,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
 )
 def test_cell_has_the_first_verdict_that_applies(changes, words, share):
     (cell,) = decision_table(summary(**changes)).values()
-    assert (cell.verdict_text, cell.displayed_share) == (words, share)
+    assert (cell.verdict_text, cell.least_displayed_share_text) == (words, share)
     (axes,) = draw_decision_table(summary(**changes)).axes
     written = [text.get_text() for text in axes.texts]
     assert words in written[0] and len(written) == 3

@@ -9,7 +9,11 @@ import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.comparison.station_accounts import (
+    start_energy,
+    station_accounts,
+    work_of_displayed_load_wrench,
+)
 from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.operator import MinimumJerk
@@ -103,7 +107,7 @@ def test_load_work_equals_potential_and_kinetic_energy(scales):
         moving = 0.5 * m * at_So @ at_So + 0.5 * omega @ inertia @ omega
         moving += (R_WS.T @ at_So) @ np.cross(omega, mc)
         energy.append(kept * moving + carried * 9.81 * (m * x[11] + (R_WS @ mc)[2]))
-    given = load_work(result, scenario)
+    given = work_of_displayed_load_wrench(result, scenario)
     expected = -0.1 / 2.0 * (np.array(energy) - energy[0])
     np.testing.assert_allclose(given.sum(axis=1), expected, atol=3e-5)
     assert np.ptp(expected) > 0.01 and np.ptp(given[:, 1]) > 1e-3
@@ -148,7 +152,10 @@ def test_station_with_ledger_creates_no_energy(sigma):
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     result = simulate(station, scenario.simulation, progress=False)
     assert np.abs(result["true_contact_wrench_W"][:, 2]).max() > 30.0, "it should have struck"
-    accounts = station_accounts(result, scenario) + sigma * load_work(result, scenario)[:, None]
+    accounts = (
+        station_accounts(result, scenario)
+        + sigma * work_of_displayed_load_wrench(result, scenario)[:, None]
+    )
     for place in (ACTUAL, MOTOR) if sigma == 0.0 else (ACTUAL,):
         created = accounts[:, HAND] + accounts[:, place] + start_energy(scenario)
         assert (created.min(axis=0) >= -1e-6).all()

@@ -16,8 +16,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.station.environment.point_contact import (
     FindContactPairs,
-    contact_force,
     depth_of_sphere_in_box,
+    point_contact_force_into,
 )
 from drake_teleop.station.environment.slot import (
     PEG_RADIUS_M,
@@ -33,7 +33,7 @@ from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant, ParseSlave
-from drake_teleop.station.slave.plant_dynamics import environment_wrench
+from drake_teleop.station.slave.plant_dynamics import environment_wrench_about_Wo_into
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 from drake_teleop.station.station import MakeTeleopStation
@@ -102,7 +102,7 @@ def test_contact_does_not_pull_a_fast_ball():
     pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact.compiled_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
     for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
-        contact_force(pair, 1e-3, up, outwards * up, force)
+        point_contact_force_into(pair, 1e-3, up, outwards * up, force)
         np.testing.assert_allclose(force, 3.0 * share * up, atol=1e-12)
 
 
@@ -183,7 +183,7 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     near = slave.plant.GetDefaultPositions(slave.instance)
     q, status = nearest_branch(R_WS.matrix(), p_WS, near, arm.lower, arm.upper)
     assert status == IkStatus.OK
-    environment_wrench(
+    environment_wrench_about_Wo_into(
         arm.table,
         slave.contact.compiled_pairs,
         slave.contact.joint_table,

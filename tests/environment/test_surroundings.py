@@ -28,7 +28,7 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise
 from drake_teleop.station.environment.environment import SeveralObjects
 from drake_teleop.station.environment.moving_bodies import (
-    MakeJointTable,
+    MakeJointTableAndRowBodies,
     interpolate_joint_state,
     poses_and_twists_into,
 )
@@ -44,7 +44,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
-    environment_wrench,
+    environment_wrench_about_Wo_into,
     tool_proximity,
 )
 from drake_teleop.station.slave.scene import Scene
@@ -87,7 +87,7 @@ def test_walls_and_boxes_follow_drakes_contact_law():
         plant.SetVelocities(context, slave.instance, v)
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
-        environment_wrench(
+        environment_wrench_about_Wo_into(
             slave.arm.table,
             slave.contact.compiled_pairs,
             slave.contact.joint_table,
@@ -145,7 +145,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         expected = contact_wrench_W(results, slave.contact.tool_bodies, slave.contact.tool_shapes)
         arm = [get(context, slave.instance) for get in (plant.GetPositions, plant.GetVelocities)]
         state = plant.GetPositionsAndVelocities(context)
-        environment_wrench(
+        environment_wrench_about_Wo_into(
             *(
                 slave.arm.table,
                 slave.contact.compiled_pairs,
@@ -167,7 +167,7 @@ def test_bodies_move_smoothly_between_two_states():
     """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
-    (joints, order), h = MakeJointTable(plant, bodies), 0.002
+    (joints, order), h = MakeJointTableAndRowBodies(plant, bodies), 0.002
     assert order == [int(body) for body in bodies]
 
     def state(t: float) -> np.ndarray:
@@ -214,7 +214,7 @@ def test_chain_of_all_joints_moves_as_in_drake():
     context, state = plant.CreateDefaultContext(), rng.normal(size=17)
     state[:4] /= np.linalg.norm(state[:4])
     plant.SetPositionsAndVelocities(context, state)
-    joints, _ = MakeJointTable(plant, [body.index() for body in bodies])
+    joints, _ = MakeJointTableAndRowBodies(plant, [body.index() for body in bodies])
     found = np.empty((3, 13))
     poses_and_twists_into(joints, state, found)
     for row, body in zip(found, bodies, strict=True):

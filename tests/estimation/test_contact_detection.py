@@ -20,7 +20,7 @@ from drake_teleop.station.estimation.contact_detection import (
 )
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import sensor_accelerations
+from drake_teleop.station.slave.arm import accelerations_from_specific_forces
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
@@ -109,7 +109,7 @@ def test_block_equals_the_detector_of_logs(arm, statistic):
         hold=50,
         following=1e-3 / 20.0,
     )
-    rows = (contact, s, omega, alpha, sensor_accelerations(arm, q, s))
+    rows = (contact, s, omega, alpha, accelerations_from_specific_forces(arm, q, s))
     expected = detector.detect(*(x[good] for x in rows))
     assert expected.any() and not expected.all()
     np.testing.assert_array_equal(np.array(flags)[good], expected)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import sosfilt
 
-from drake_teleop.common.config import check_ranges
+from drake_teleop.common.config import check_all_field_values
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
@@ -131,4 +131,4 @@ def test_total_least_squares_removes_the_bias_of_acceleration_noise():
 
 def test_unknown_method_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"method: there is no recursive estimator 'tls'"):
-        check_ranges(LoadEstimatorConfig(method="tls"), "load_estimator")
+        check_all_field_values(LoadEstimatorConfig(method="tls"), "load_estimator")

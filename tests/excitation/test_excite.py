@@ -23,15 +23,15 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.lab.excitation import excite as excite_module
 from drake_teleop.lab.excitation.check import check_motion, check_trajectory
-from drake_teleop.lab.excitation.excite import excite, sensor_motion
+from drake_teleop.lab.excitation.excite import excite, trajectory_sensor_motion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    empty_motions,
+    allocate_link_motions,
     write_link_motions,
     write_sensor_motion,
 )
 from drake_teleop.lab.excitation.motion_replay import write_motion_replay
-from drake_teleop.lab.excitation.optimizer import Iterate
+from drake_teleop.lab.excitation.optimizer import FeasibleIterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.lab.identification import identify_load
@@ -183,7 +183,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     table, phi = slave.arm.table, slave.limits.heaviest_phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(t), 3))
     write_sensor_motion(motions, vectors)
@@ -206,7 +206,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
 
 @pytest.mark.slow
 def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
-    motion = sensor_motion(slave, designed.trajectory)
+    motion = trajectory_sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.sensor_noise, slave.limits.heaviest_phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
     # Deviations: encoders only < fused < accelerometer only.
@@ -565,7 +565,7 @@ def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
-    monkeypatch.setattr("drake_teleop.station.slave.plant.finalize_plant", refused)
+    monkeypatch.setattr("drake_teleop.station.slave.plant.finalize_without_limit_warnings", refused)
     with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
@@ -773,7 +773,7 @@ def test_identified_load_of_another_arm_is_true(other_arm, write_log, tmp_path):
 def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, monkeypatch, found):
     """No design at all, and one whose posture is beyond the joint limits."""
     high = slave.limits.q_middle + 1.5 * slave.limits.q_half
-    bad = Iterate(1.0, 10, 0, 3.0, dataclasses.replace(short.trajectory, q0=high))
+    bad = FeasibleIterate(1.0, 10, 0, 3.0, dataclasses.replace(short.trajectory, q0=high))
     designs = [] if found == "none" else [bad]
     monkeypatch.setattr(excite_module, "minimise_criterion", lambda *_, **__: designs)
     small = excite(slave, period=2.4, harmonics=2, progress=False)

@@ -14,14 +14,14 @@ from drake_teleop.lab.excitation.criteria import (
     CRITERIA,
     Criterion,
     CriterionScales,
-    characteristic_length,
+    limited_gyration_radius,
 )
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
+    allocate_link_motions,
     capsule_distances,
-    empty_motions,
     write_limit_uses,
     write_link_motions,
 )
@@ -123,11 +123,11 @@ def test_error_filter_has_the_poles_of_the_motion_filter():
 
 
 def test_characteristic_length_is_at_most_the_radius_of_gyration():
-    assert characteristic_length(PHI) == pytest.approx(0.1, rel=0.05)
+    assert limited_gyration_radius(PHI) == pytest.approx(0.1, rel=0.05)
     far = phi_from_mass_com_inertia(2.0, [0, 0, 0.3], 0.01 * np.eye(3))
-    assert characteristic_length(far) == 0.1
+    assert limited_gyration_radius(far) == 0.1
     near = phi_from_mass_com_inertia(2.0, [0, 0, 0], 2.0 * 0.03**2 * np.eye(3) * 2 / 3)
-    assert characteristic_length(near) == pytest.approx(0.03)
+    assert limited_gyration_radius(near) == pytest.approx(0.03)
 
 
 def limits_of(arm) -> Limits:
@@ -193,7 +193,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
-    motions = empty_motions(30, 6)
+    motions = allocate_link_motions(30, 6)
     write_link_motions(arm.table, q, qd, qdd, motions)
     smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
     write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
@@ -290,6 +290,6 @@ def test_distances_of_capsules():
     )
     rows, radii = np.full(6, -1), np.full(6, 0.1)
     pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [4, 5], [3, 4], [4, 3]])
-    distances = capsule_distances(empty_motions(1, 1), rows, ends, radii, pairs)[0]
+    distances = capsule_distances(allocate_link_motions(1, 1), rows, ends, radii, pairs)[0]
     expected = [0.5, 0.3, 1, 2, 3, np.sqrt(8), np.sqrt(8)]
     np.testing.assert_allclose(distances, np.array(expected) - 0.2, atol=1e-12)

@@ -8,7 +8,7 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation import shortest as module
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.excite import sensor_motion
+from drake_teleop.lab.excitation.excite import trajectory_sensor_motion
 from drake_teleop.lab.excitation.optimizer import DesignTask
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
@@ -92,7 +92,7 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
     )
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)
-    motion = sensor_motion(slave, problem.trajectory(x))
+    motion = trajectory_sensor_motion(slave, problem.trajectory(x))
     covariance = predicted_covariance(*motion, 1e-3, slave.sensor_noise, slave.limits.heaviest_phi)
     known = problem.deviations(motion, 1.2)
     np.testing.assert_allclose(known, deviations_over_tolerances(errors, covariance), rtol=0.03)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
@@ -53,7 +53,7 @@ def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
         ("force_to_master", [0, 0, -peak, 0, 0, 0], strongest),
         ("hand_wrench_E", [0, 60, 0, 0, 0, 0], "the simulated hand pulls with its largest force"),
         ("ports", [0, 0, 0, 0, 0, 0.06, 0, 0], "the network delivers no packets"),
-        ("fault", float(Fault.WRENCH), FAULT_MEANINGS[Fault.WRENCH]),
+        ("fault", float(Fault.WRENCH), FAULT_WARNINGS[Fault.WRENCH]),
     ):
         found = {key: values.copy() for key, values in rows.items()}
         found.setdefault(name, np.zeros((len(rows["t"]), np.size(change))))[1] = change

@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import INPUTS_FILE, models_dir
+from drake_teleop.common.files import DRIVE_INPUTS_FILE_NAME, models_dir
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import TARGET_LEAD_TIME_S
@@ -350,9 +350,9 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
     ],
 )
 def test_invalid_file_of_inputs_is_one_error_line(tmp_path, text, message):
-    (tmp_path / INPUTS_FILE).write_text(text)
+    (tmp_path / DRIVE_INPUTS_FILE_NAME).write_text(text)
     with pytest.raises(DrakeTeleopError, match=message):
-        read_inputs(tmp_path / INPUTS_FILE, MADE_BY)
+        read_inputs(tmp_path / DRIVE_INPUTS_FILE_NAME, MADE_BY)
 
 
 def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
@@ -368,7 +368,7 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
 
 
 def test_incomplete_last_line_is_ignored(tmp_path):
-    path = tmp_path / INPUTS_FILE
+    path = tmp_path / DRIVE_INPUTS_FILE_NAME
     path.write_text(
         HEADER + csv_row(0, Inputs()) + csv_row(5, Inputs(x=3)) + csv_row(10, Inputs())[:9]
     )

@@ -35,7 +35,7 @@ from drake_teleop.load.contact.noise_floor import (
     MAX_SUMMED_SAMPLES,
     STATISTIC_NAMES,
     NoiseFloor,
-    limit_covariance,
+    limit_covariance_to_scales,
 )
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.load.regressor import non_contact_wrench, regressor
@@ -162,10 +162,10 @@ def test_slow_error_does_not_raise_the_threshold_of_quick_contacts():
 
 def test_undetermined_parameters_have_their_natural_scale():
     covariance = np.diag(np.r_[np.full(6, 0.01), np.full(4, 1e-6), np.full(6, np.inf)])
-    P = limit_covariance(TOOL, covariance)
+    P = limit_covariance_to_scales(TOOL, covariance)
     np.testing.assert_allclose(np.diag(P)[10:], natural_scales(TOOL)[10:] ** 2)
     np.testing.assert_array_equal(P[:10, :10], covariance[:10, :10])
-    assert (limit_covariance(TOOL, covariance, tared=True)[:6] == 0.0).all()
+    assert (limit_covariance_to_scales(TOOL, covariance, tared=True)[:6] == 0.0).all()
 
 
 # The statistics

@@ -12,9 +12,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     deviations_over_tolerances,
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
 
 ALL = "mass 0.5 %, com 0.5 mm, inertia 5 %"
@@ -41,9 +41,13 @@ def test_invalid_tolerance_is_refused(text: str) -> None:
 def test_derivatives_equal_finite_differences() -> None:
     tolerance, step = parse_tolerance(ALL), 1e-6
     steps = step * np.eye(10)
-    values = partial(required_values, tolerance)
+    values = partial(display_values_of_required_entries, tolerance)
     differences = [values(PHI + row) - values(PHI - row) for row in steps]
-    numbers = np.array(differences).T / (2.0 * step) / tolerances_in_units(tolerance, PHI)[:, None]
+    numbers = (
+        np.array(differences).T
+        / (2.0 * step)
+        / tolerances_in_display_units(tolerance, PHI)[:, None]
+    )
     errors = derivatives_over_tolerances(tolerance, PHI)
     np.testing.assert_array_equal(errors[:, :6], 0.0)
     np.testing.assert_allclose(errors[:, 6:], numbers, rtol=1e-6, atol=1e-6 * np.abs(numbers).max())

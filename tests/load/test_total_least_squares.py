@@ -56,7 +56,7 @@ def test_moments_equal_those_of_the_stacked_matrix():
 
 def test_noise_covariance_predicts_the_residual():
     clean = record(5000)
-    Q = moments_of(clean).noise_covariance(NOISE, WRENCH_NOISE)
+    Q = moments_of(clean).mean_noise_covariance_of_z(NOISE, WRENCH_NOISE)
     S = residual_covariance(moments_of(noisy(clean, 4)).mean_products, TRUTH)
     scale = np.sqrt(np.outer(np.diag(S), np.diag(S)))
     np.testing.assert_allclose(S / scale, residual_covariance(Q, TRUTH) / scale, atol=0.06)
@@ -71,7 +71,7 @@ def test_noise_of_each_axis_of_the_gyroscope_enters_its_products():
         w = [clean[2] + sign * np.eye(3)[k] for sign in (-1.0, 1.0)]
         low, high = (x[:, [0, 1, 2, 0, 0, 1]] * x[:, [0, 1, 2, 1, 2, 2]] for x in w)
         expected[13:, 13:] += std[k] ** 2 * (high - low).T @ (high - low) / 4.0 / 200
-    Q = moments_of(clean).noise_covariance(NoiseStd(omega=std), np.zeros(6))
+    Q = moments_of(clean).mean_noise_covariance_of_z(NoiseStd(omega=std), np.zeros(6))
     np.testing.assert_allclose(Q, expected, rtol=1e-9, atol=1e-15)
 
 

@@ -13,11 +13,11 @@ from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
 from drake_teleop.logs.causes.cause import causes_of_fit, loads_between_changes
-from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
+from drake_teleop.logs.causes.changes import find_contact_spans, fit_steps_at_middle_of_ramps
 from drake_teleop.logs.causes.explain import _apply_fitted_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
-from drake_teleop.logs.causes.state import State, score_statistic
+from drake_teleop.logs.causes.state import FittedModel, score_statistic
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -27,7 +27,7 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     data = record(np.zeros((len(T), 6)))
     state = SimpleNamespace(model=model, x=x, covariance=covariance, data=data, contact_spans=spans)
-    state.parameters_of_extension = partial(State.parameters_of_extension, state)
+    state.parameters_of_extension = partial(FittedModel.parameters_of_extension, state)
     return state
 
 
@@ -120,7 +120,7 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
     def with_delay(delay: float):
         return block_means_of_record(T, wrench, moving(T + delay - before - late), GRAVITY_W)
 
-    state = State.fit_record(with_delay(before), Model())
+    state = FittedModel.fit_record(with_delay(before), Model())
     assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
     after, delay = _apply_fitted_delay(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
@@ -153,8 +153,8 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
     wrench += share * ("offsets" in kinds) * step
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
-    state = State.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
-    found = fit_with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
+    state = FittedModel.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
+    found = fit_steps_at_middle_of_ramps(state, [kinds], [guess], ((100.5, 100.6),))
     assert found.contact_spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
     assert found.model.steps[0].time == 100.99
@@ -176,7 +176,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     touched = ((start < T) & (stop > T))[:, None]
     wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
-    state = State.fit_record(record(wrench), Model())
+    state = FittedModel.fit_record(record(wrench), Model())
     ((found_start, found_stop),) = find_contact_spans(state)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
@@ -204,7 +204,7 @@ def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) ->
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     assert (
         find_contact_spans(
-            State.fit_record(block_means_of_record(t, wrench, motion, GRAVITY_W), Model())
+            FittedModel.fit_record(block_means_of_record(t, wrench, motion, GRAVITY_W), Model())
         )
         == ()
     )

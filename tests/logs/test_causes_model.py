@@ -14,12 +14,12 @@ from drake_teleop.logs import explained_log
 from drake_teleop.logs.causes.candidates import Candidate
 from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
-    Instants,
+    BlockMeans,
     block_means_of_record,
     delay_of_free_fit,
 )
 from drake_teleop.logs.causes.intervals import (
-    _variances_of_rejected_causes,
+    _load_variances_by_rejected_causes,
     widening_factor_by_misfit,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, Model, StepChange
@@ -45,7 +45,7 @@ def moving(t: np.ndarray) -> tuple[np.ndarray, ...]:
     return s, 2.0 * x[:, 6:9], 9.0 * np.roll(x[:, 6:9], 1, axis=1), R_WS, 0.3 * x[:, 9:]
 
 
-def record(wrench: np.ndarray) -> Instants:
+def record(wrench: np.ndarray) -> BlockMeans:
     return block_means_of_record(T, wrench, moving(T), GRAVITY_W)
 
 
@@ -250,7 +250,7 @@ def test_rejected_causes_widen_the_load_by_their_score_or_smaller_residual():
         (0.0, 0.4, 1.0),
     ):
         rejected = [Candidate("drift", fit(3.0, ratio), score)]
-        found = _variances_of_rejected_causes(fit(0.0, 1.0), rejected)
+        found = _load_variances_by_rejected_causes(fit(0.0, 1.0), rejected)
         np.testing.assert_allclose(found, share * (3.0**2 + 4.0))
 
 
@@ -267,7 +267,7 @@ def test_samples_near_the_ends_of_wrench_and_poses_are_not_used(monkeypatch, lon
     )
     posed = SimpleNamespace(gravity_W=GRAVITY_W, poses=SimpleNamespace(position=np.zeros((2, 3))))
     log = SimpleNamespace(t=T, wrench=np.zeros((len(T), 6)), bridged=None, posed=posed)
-    data = explained_log._spline_instants(log, SimpleNamespace(splines=splines), 0.1)
+    data = explained_log._block_means_of_splines(log, SimpleNamespace(splines=splines), 0.1)
     late = 0.0 if longer else 0.1
     kept = (T[0] + 0.4 <= T) & (T[-1] - 0.4 - late >= T)
     differs = np.flatnonzero(data.used != kept)

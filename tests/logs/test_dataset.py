@@ -23,8 +23,8 @@ from drake_teleop.logs.dataset.dataset_files import open_dataset
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
-    find_hypothesis,
     find_offset_step,
+    find_simplest_hypothesis_and_residual,
 )
 from drake_teleop.logs.dataset.shared_load import find_shared_load
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
@@ -49,7 +49,9 @@ def log_of(x: SampleEpisode) -> Log:
 def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x))
-    found, residual = find_hypothesis(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
+    found, residual = find_simplest_hypothesis_and_residual(
+        signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD
+    )
     names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(residual, found.spread)
     return names | ({"tared"} if step is not None else set())
@@ -123,7 +125,9 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     squares = []
     for number in range(6):
         x = sample_episode(number, phi=phi, contacts=0)
-        reading, load_wrench = EpisodeSignals(log_of(x)).predict_reading(phi, "sensor", 0.0)
+        reading, load_wrench = EpisodeSignals(log_of(x)).measured_and_load_wrench(
+            phi, "sensor", 0.0
+        )
         rest = reading - load_wrench
         squares.append(((rest - np.median(rest, axis=0)) / WRENCH_NOISE_STD) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
@@ -140,7 +144,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x))
-    found, _ = find_hypothesis(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
+    found, _ = find_simplest_hypothesis_and_residual(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
     assert np.degrees(Rotation.from_matrix(found.force_axes @ R.T).magnitude()) < 3.0
 
 

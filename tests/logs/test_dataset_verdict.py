@@ -13,11 +13,11 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturation_faults
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
-    Hypothesis,
+    WrenchHypothesis,
     _weighted_number_of_faults,
     find_offset_step,
     hypothesis_without_fault,
-    spread_and_centre_of_calm_half,
+    ln_half_width_and_centre_of_calm_half,
 )
 from drake_teleop.logs.sample import TRUE_PHI, sample_episode
 
@@ -85,7 +85,7 @@ def test_each_deviation_increases_the_cost(change, count):
 @pytest.mark.parametrize("gain", [(1.0, 1.0), (0.3, 7.0)])
 def test_correct_is_the_inverse_of_apply(gain):
     wrench = np.random.default_rng(0).normal(size=(9, 6))
-    x = Hypothesis("sensor", 0.0, SKEW, -QUARTER, np.array(gain))
+    x = WrenchHypothesis("sensor", 0.0, SKEW, -QUARTER, np.array(gain))
     read = x.reading_of_load(wrench)
     np.testing.assert_allclose(read[:, :3], gain[0] * wrench[:, :3] @ SKEW.T)
     np.testing.assert_allclose(read[:, 3:], -gain[1] * wrench[:, 3:] @ QUARTER.T)
@@ -95,7 +95,7 @@ def test_correct_is_the_inverse_of_apply(gain):
 def test_calm_half_is_the_narrowest_half_of_each_channel():
     """Five of 8 numbers are within 2 half widths: the half has 4 intervals."""
     x = np.array([5.0, 5.25, 5.5, 5.75, 6.0, 9.0, -20.0, 40.0])
-    spread, centres = spread_and_centre_of_calm_half(
+    spread, centres = ln_half_width_and_centre_of_calm_half(
         np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3)
     )
     np.testing.assert_allclose(np.exp(spread), [0.5, 1.0, 1e-3])
@@ -112,7 +112,7 @@ def test_step_of_the_offsets_is_found_inside_the_episode(step, at, found, channe
     before = np.arange(6.0)
     residual = noise + before
     residual[at:, channel] += step
-    spread = spread_and_centre_of_calm_half(noise, np.zeros(6))[0]
+    spread = ln_half_width_and_centre_of_calm_half(noise, np.zeros(6))[0]
     jump = find_offset_step(residual, spread)
     assert (jump is not None) == found
     if jump is not None:
@@ -143,15 +143,15 @@ def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
     signals = EpisodeSignals(log_of(x))
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
-    w = signals.predict_reading(TRUE_PHI, "sensor", lag)
+    w = signals.measured_and_load_wrench(TRUE_PHI, "sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)
     expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_PHI)
     np.testing.assert_allclose(w[1], expected, atol=1e-6)
     np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_PHI, expected, atol=1e-6)
-    weightless = signals.predict_reading(TRUE_PHI, "weight removed", lag)[1]
+    weightless = signals.measured_and_load_wrench(TRUE_PHI, "weight removed", lag)[1]
     weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_PHI)
     np.testing.assert_allclose(weightless, expected - weight, atol=1e-6)
-    turned = signals.predict_reading(TRUE_PHI, "base", lag)[0]
+    turned = signals.measured_and_load_wrench(TRUE_PHI, "base", lag)[0]
     for part in (slice(0, 3), slice(3, 6)):
         back = np.einsum("nij,nj->ni", at.R_WS, turned[:, part])
         np.testing.assert_allclose(back, x.wrench[:, part], atol=2e-3)

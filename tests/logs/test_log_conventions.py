@@ -346,6 +346,8 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
     predicted = (1 - np.sqrt(left)) * wrench
     if refused:
         with pytest.raises(DrakeTeleopError, match=refused):
-            conventions.check_suspicious_load(log, load, predicted, 0.0, check)
+            conventions.findings_if_load_is_suspicious(log, load, predicted, 0.0, check)
     else:
-        assert conventions.check_suspicious_load(log, load, predicted, 0.0, check) == (reason,)
+        assert conventions.findings_if_load_is_suspicious(log, load, predicted, 0.0, check) == (
+            reason,
+        )

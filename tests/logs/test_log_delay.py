@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.against_load import LoadFit, fit_load
+from drake_teleop.logs.check.against_load import LoadFitQuality, fit_load
 from drake_teleop.logs.read.alignment import estimate_delay
 from drake_teleop.logs.read.canonical import Log
 
@@ -85,5 +85,5 @@ def test_poses_at_rest_are_independent_and_give_the_mass() -> None:
 
 
 def test_good_fit_has_a_small_residual_and_a_positive_mass() -> None:
-    assert LoadFit(0.001, 1.0).is_good
-    assert not LoadFit(0.9, 1.0).is_good and not LoadFit(0.001, -1.0).is_good
+    assert LoadFitQuality(0.001, 1.0).is_good
+    assert not LoadFitQuality(0.9, 1.0).is_good and not LoadFitQuality(0.001, -1.0).is_good

@@ -48,7 +48,7 @@ def test_failing_check_does_not_stop_identify(sample_tables, error, monkeypatch)
     def fail(*_):
         raise error("of our own")
 
-    monkeypatch.setattr(processing, "check_file", fail)
+    monkeypatch.setattr(processing, "check_conventions_of_file", fail)
     monkeypatch.setattr(conventions, "_are_signals_suspicious", lambda _: True)
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 

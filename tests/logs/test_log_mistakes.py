@@ -23,7 +23,7 @@ from drake_teleop.logs.check.imu_checks import (
     check_imu_signals,
 )
 from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.check.pose_checks import position_findings
+from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS, Log
 from drake_teleop.logs.read.description import Description
@@ -214,7 +214,7 @@ def test_position_of_another_point_or_unit_is_named(scale: float, name: str, lin
     at, rng = motion_at(np.arange(0.0, 12.0, 0.01)), np.random.default_rng(1)
     place = np.array([0.03, -0.02, 0.15])
     position = scale * (at.p_WS + at.R_WS @ place + 1e-4 * rng.normal(size=at.p_WS.shape))
-    (finding,) = position_findings(*imu_and_pose(np.eye(3), position=position), 0.0)
+    (finding,) = position_unit_or_origin_findings(*imu_and_pose(np.eye(3), position=position), 0.0)
     assert finding.name == name and line in finding.message
     if name == "pose frame":
         found = yaml.safe_load(re.findall(r"position_in_sensor: (\[.*?\])", finding.message)[0])
@@ -225,7 +225,9 @@ def test_lag_of_a_drifting_clock_is_given_at_the_first_row() -> None:
     drifting = SimpleNamespace(
         mid_record_lag_s=0.3, clock_drift=2e-3, mid_record_time_s=50.0, lag_s=0.31
     )
-    data = SimpleNamespace(correct_clock_drift=lambda *given: (given[2], "both", given))
+    data = SimpleNamespace(
+        start_lag_and_clock_drift_correction=lambda *given: (given[2], "both", given)
+    )
     description = SimpleNamespace(imu="an IMU")
     finding, (stream, _, _, drift) = _correct_imu_clock(description, drifting, data)
     assert (stream, drift) == ("imu", 2e-3)

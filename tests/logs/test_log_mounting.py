@@ -31,7 +31,7 @@ from drake_teleop.logs.read.mounting import (
     lag_of_imu_clock,
     lever_arm_from_wrench,
 )
-from drake_teleop.logs.read.reading import read_description, read_log
+from drake_teleop.logs.read.reading import read_described_log, read_log
 from drake_teleop.logs.read.tables import Table
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
@@ -114,9 +114,9 @@ def mounting(
     recorder: Recorder, tables: dict[Path, Table] | None = None, **streams: bool
 ) -> Mounting:
     description, tables = described(**streams), tables or recorder.tables()
-    imu = read_description(description, "log.yaml", tables=tables)
+    imu = read_described_log(description, "log.yaml", tables=tables)
     alone = description.model_copy(update={"imu": None})
-    pose = read_description(alone, "log.yaml", tables=tables)
+    pose = read_described_log(alone, "log.yaml", tables=tables)
     found = find_mounting(imu, pose, position=streams.get("positioned", True))
     assert found is not None
     return found
@@ -190,10 +190,10 @@ def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
     recorder = Recorder(random_rotation(seed), p, seed, noise=3.0)
     description = described(pose=False, frame=recorder.R_SI.tolist())
     tables = recorder.tables()
-    found = lever_arm_from_wrench(read_description(description, "log.yaml", tables=tables))
+    found = lever_arm_from_wrench(read_described_log(description, "log.yaml", tables=tables))
     assert found is not None and found.is_determined_by_axis.all()
     assert (np.abs(found.p_SoIo_S - p) < 4 * found.deviations + 3e-4).all()
-    auto = read_description(
+    auto = read_described_log(
         described(pose=False, frame=recorder.R_SI.tolist(), position="auto"),
         "log.yaml",
         tables=tables,
@@ -229,13 +229,13 @@ def test_contact_prevents_a_lever_arm_from_the_wrench() -> None:
         tables[Path("w")], columns=tables[Path("w")].columns | {"f": touched}
     )
     with pytest.raises(DrakeTeleopError, match="determine the position of the accelerometer"):
-        read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
+        read_described_log(described(pose=False, position="auto"), "log.yaml", tables=tables)
 
 
 @pytest.mark.parametrize(("force", "torque"), [(0.043, 0.043), (0.0, 0.057)])
 def test_load_may_leave_5_percent_of_the_wrench_unexplained(force: float, torque: float) -> None:
     recorder = Recorder(np.eye(3), np.array([0.05, 0, 0]))
-    log = read_description(described(pose=False), "log.yaml", tables=recorder.tables())
+    log = read_described_log(described(pose=False), "log.yaml", tables=recorder.tables())
     touch = np.zeros((len(log), 2, 3))
     # The motion explains a small part of a step of 1/6 of the record.
     touch[len(log) // 3 : len(log) // 2, :, 0] = 1.0
@@ -250,7 +250,7 @@ def test_load_may_leave_5_percent_of_the_wrench_unexplained(force: float, torque
 def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None:
     recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=rotation_about_y)
     streams = {"pose": True} if source == "pose" else {"pose": False}
-    at_Io = read_description(described(**streams), "log.yaml", tables=recorder.tables())
+    at_Io = read_described_log(described(**streams), "log.yaml", tables=recorder.tables())
     lever = mounting(recorder).lever_arm if source == "pose" else lever_arm_from_wrench(at_Io)
     assert lever is not None and lever.source == source
     assert lever.is_determined_by_axis.tolist() == [True, False, True]
@@ -258,7 +258,7 @@ def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None
     error = (lever.p_SoIo_S - recorder.p_SoIo_S)[known]
     assert (np.abs(error) < 4 * lever.deviations[known] + 3e-4).all()
     with pytest.raises(DrakeTeleopError, match=r"imu.position: .*determine y of"):
-        read_description(
+        read_described_log(
             described(**streams, position="auto"), "log.yaml", tables=recorder.tables()
         )
 
@@ -349,7 +349,7 @@ def test_undetermined_rotation_raises_error(changes: dict[str, Any], words: list
         columns |= {"omega": np.degrees(columns["omega"])}
     description = described(frame="auto", sign=changes.get("sign", 1))
     with pytest.raises(DrakeTeleopError) as error:
-        read_description(description, "log.yaml", tables=tables)
+        read_described_log(description, "log.yaml", tables=tables)
     message = str(error.value)
     assert message.startswith("log.yaml:imu.frame: the data do not determine the rotation")
     for word in words:
@@ -368,7 +368,7 @@ def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:
     tables = Recorder(RIGHT_ANGLED, np.zeros(3)).tables()
     late = tables[Path("i")].columns["t"] + 0.2
     tables[Path("i")] = replace(tables[Path("i")], columns=tables[Path("i")].columns | {"t": late})
-    log = read_description(described(frame="auto"), "log.yaml", tables=tables)
+    log = read_described_log(described(frame="auto"), "log.yaml", tables=tables)
     assert any("lags that of the pose by 0.206 s" in note for note in log.notes)
     s = motion_at(log.t - LAG - 0.2).specific_force
     assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
@@ -446,7 +446,7 @@ def test_ur5_imu_has_the_axes_of_the_tool(ur5: Path) -> None:
             "pose": stream("log_tool_vector", "s", orientation=rotation, position=first),
         }
     )
-    notes = read_description(description, "log.yaml").notes
+    notes = read_described_log(description, "log.yaml").notes
     found = next(note for note in notes if note.startswith("imu.frame found"))
     R_SI = np.array(yaml.safe_load(found.split("imu.frame: ")[1]))
     assert np.linalg.norm(rotation_vector_deg(R_SI)) < 1.0

@@ -13,7 +13,7 @@ from drake_teleop.common.rotations import (
     orthogonality_error,
     rotation_matrices,
 )
-from drake_teleop.logs.read.mounting import nonlinear_least_squares
+from drake_teleop.logs.read.mounting import least_squares_with_deviations
 from drake_teleop.logs.read.streams import OrientationColumns
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
@@ -35,13 +35,13 @@ def test_all_rotation_forms_give_the_same_matrix(form: str) -> None:
 
 def test_solve_handles_a_zero_residual() -> None:
     exact = np.array([0.3, -2.0])
-    x, deviations = nonlinear_least_squares(
+    x, deviations = least_squares_with_deviations(
         lambda x: np.outer(np.arange(60.0), [1, 1, 1]) * (x - exact).sum(), exact
     )
     np.testing.assert_array_equal(x, exact)
     assert np.isinf(deviations).all()  # only the sum is determined
     noise = np.random.default_rng(3).normal(size=(200, 3))
-    x, _ = nonlinear_least_squares(
+    x, _ = least_squares_with_deviations(
         lambda x: np.hstack([x[:1] - noise, np.full((200, 3), x[1])]), np.ones(2)
     )
     np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # one half has a zero residual

@@ -123,7 +123,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
             np.abs(signal_spectrum(grid, taper, error, len(bands.frequency))) ** 2
         )
         Q = noise_moments(splines, grid, taper, clean, bands, splines.estimate_pose_noise())
-        fast = bands.sums_over_bands(bands.frequency) / bands.band_sizes > 2.0
+        fast = bands.sums_over_bands(bands.frequency) / bands.half_dof_of_bands > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()
             said[k] += np.diagonal(Q, axis1=1, axis2=2)[fast, where].sum()

@@ -29,7 +29,7 @@ from posed_record import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import use_spline_motion
+from drake_teleop.logs.aligned_log import use_spline_motion_and_flag_edges
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
     _taper_without_gaps,
@@ -37,7 +37,7 @@ from drake_teleop.logs.pose_motion.estimate import (
 )
 from drake_teleop.logs.pose_motion.linear_model import (
     FitWindow,
-    find_best_delay,
+    find_best_delay_and_cost,
     fit_linear_model,
     fit_noise_levels,
 )
@@ -47,9 +47,9 @@ from drake_teleop.logs.pose_motion.rigid import (
     RigidParameters,
     UnitsAndAxes,
     _add_rigid_step,
-    _FitData,
     _parameter_errors_of_unit_gains,
     _residual_and_derivative,
+    _RigidFitData,
     _solve_rigid_fit,
     estimate_units_and_axes,
     fit_rigid,
@@ -117,7 +117,7 @@ def test_samples_within_two_knots_of_ends_and_gaps_are_flagged(spacing, delay):
     posed = SimpleNamespace(gravity_W=GRAVITY_W)
     log = Log(t, wrench, *np.zeros((3, len(t), 3)), posed=posed)
     found = SimpleNamespace(delay_s=delay, splines=PoseSplines(poses, spacing))
-    moved, flags = use_spline_motion(log, found)
+    moved, flags = use_spline_motion_and_flag_edges(log, found)
     at = moved.t + delay
     gap = np.searchsorted(poses.t, 7.3)
     ends = poses.t[[0, gap - 1, gap, -1]]
@@ -198,7 +198,7 @@ def test_noise_moments_predict_the_effect_of_noise():
         sums += second_moments(spectrum, none, bands, rates * spectrum) / 12
     # Below 2 Hz the motion modulates additional noise from higher frequencies.
     whole = NoiseLevels.white_within_groups(bands).sums_over_groups
-    well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.band_sizes) > 2.0
+    well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.half_dof_of_bands) > 2.0
     sums, Q = whole(sums), whole(Q)
     size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
     error = np.abs(sums - Q)[well] / np.where(size > 0.0, size, np.inf)[well]
@@ -297,7 +297,7 @@ def test_noise_of_poses_does_not_bias_the_load():
     free, start = np.arange(23) < 17, RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
-        record_ = _FitData(
+        record_ = _RigidFitData(
             spectra.second_moments(),
             noise,
             NoiseLevels.white_within_groups(spectra.bands),
@@ -478,14 +478,14 @@ def test_gain_effects_predict_the_change_of_the_estimate():
     )
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit_coefficients().noise_power
-    solution = _solve_rigid_fit(_FitData(Z, none, levels, free, power), start)
+    solution = _solve_rigid_fit(_RigidFitData(Z, none, levels, free, power), start)
     effects = _parameter_errors_of_unit_gains(solution, Z).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)
         A[16 + d, 16 + k] += 1e-3 * UNITS[d, k]
         other = _solve_rigid_fit(
-            _FitData(A @ Z @ A.T, none, levels, free, power), solution.parameters
+            _RigidFitData(A @ Z @ A.T, none, levels, free, power), solution.parameters
         ).parameters
         moved = 1e3 * (other.theta - solution.parameters.theta)
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
@@ -501,7 +501,7 @@ def test_wandering_channels_are_found_and_get_less_weight():
     splines = PoseSplines(poses.with_continuous_quaternions(), 0.1)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
     levels = fit_noise_levels(spectra.second_moments(), spectra.bands)
-    at = spectra.bands.sums_over_bands(spectra.bands.frequency) / spectra.bands.band_sizes
+    at = spectra.bands.sums_over_bands(spectra.bands.frequency) / spectra.bands.half_dof_of_bands
     corner = np.sqrt(levels.relative_power - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
@@ -552,7 +552,7 @@ def test_best_delay_is_found_from_a_distant_start():
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(
         PoseSplines(poses.with_continuous_quaternions(), 0.07), -0.05
     )
-    assert find_best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
+    assert find_best_delay_and_cost(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
 @pytest.mark.parametrize("chopped", [False, True])

@@ -17,7 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
-from drake_teleop.logs.check.corrections import edit_with_opposite_wrench_sign, pose_edits
+from drake_teleop.logs.check.corrections import (
+    edit_with_opposite_wrench_sign,
+    orientation_and_gravity_sign_edits,
+)
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
@@ -465,7 +468,11 @@ def test_order_of_quaternions_and_sign_are_found_together(
 
 def test_a_correction_with_the_opposite_sign_states_both(tmp_path: Path) -> None:
     description = load_description(described(tmp_path, table()))
-    finding, edited = next(x for x in pose_edits(description) if x[0].name == "quaternion order")
+    finding, edited = next(
+        x
+        for x in orientation_and_gravity_sign_edits(description)
+        if x[0].name == "quaternion order"
+    )
     both, changed = edit_with_opposite_wrench_sign(finding, edited)
     assert both.fields == {"pose.orientation.form": "quaternion_xyzw", "wrench.sign": -1}
     assert changed.wrench is not None and changed.wrench.sign == -1

@@ -12,17 +12,17 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import device, dynamics, phantom
-from drake_teleop.station.master.data_sheets import JointFriction, Master
+from drake_teleop.station.master.data_sheets import Master, PhantomJointFriction
 from drake_teleop.station.master.force_display import initial_display_state
 
-NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
+NO_FRICTION = PhantomJointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
 
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
     """Return postures inside all joint limits, including the five-bar's."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(phantom.JOINT_LOWER_RAD, phantom.JOINT_UPPER_RAD, (40 * count, 6))
-    lower, upper = phantom.FIVE_BAR_RANGE_RAD
+    lower, upper = phantom.Q2_MINUS_Q3_RANGE_RAD
     allowed = (q[:, 1] - q[:, 2] > lower) & (q[:, 1] - q[:, 2] < upper)
     return q[allowed][:count]
 
@@ -254,7 +254,7 @@ def test_energy_is_conserved_in_free_motion_to_fourth_order():
 
 
 def test_friction_dissipates_energy():
-    friction = parameters(friction=JointFriction())
+    friction = parameters(friction=PhantomJointFriction())
     torque = np.zeros(6)
     state = free_state()
     for _ in range(200):
@@ -300,7 +300,7 @@ def test_joint_stops_at_its_limit(joint, side):
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
     push = side * np.array([2.0, 2.0, 2.0, 0.05, 0.05, 0.05]) * np.eye(6)[joint]
-    friction = parameters(friction=JointFriction())
+    friction = parameters(friction=PhantomJointFriction())
     state, farthest = np.concatenate([q, np.zeros(6)]), 0.0
     for _ in range(2000):
         torque = push + arrays.gravity_torque(state[:6])
@@ -333,7 +333,7 @@ def test_end_stop_pushes_but_never_pulls(joint, side):
 
 
 def test_the_five_bar_stops_at_its_limits():
-    friction = parameters(friction=JointFriction())
+    friction = parameters(friction=PhantomJointFriction())
     for side, limit in ((1, np.radians(65)), (-1, np.radians(-55))):
         state = np.zeros(12)
         for _ in range(3000):
@@ -391,7 +391,7 @@ def test_friction_too_large_for_the_step_is_rejected(name, slope):
     """The last wrist joint has 1.5e-4 kg m^2: a step of 0.5 ms allows 0.6 N m s."""
 
     def make_device(last):
-        friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
+        friction = PhantomJointFriction(**{name: [*[0.0] * 5, slope * last]})
         model = Master(friction=friction).device(0.1, 1e-4)
         device.MasterDevice(5e-4, model, phantom.HOME_POSTURE_RAD)
 

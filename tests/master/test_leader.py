@@ -173,7 +173,7 @@ def test_joints_have_end_stops():
     assert np.isfinite(q).all()
     assert (q > limits[0] - 0.1).all() and (q < limits[1] + 0.1).all()
     beyond = np.clip(q, *limits) + np.where(q > 0, 1e-9, -1e-9)
-    assert device.is_at_end_stop(
+    assert device.is_any_axis_at_end_stop(
         np.array([HOME, np.maximum(beyond, limits[1] + 1e-6)])
     ).tolist() == [
         False,
@@ -207,7 +207,7 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
     assert side.GetOutputPort("master_state").size() == 12
     pose = side.GetOutputPort("pose_master").Eval(side.CreateDefaultContext())
     np.testing.assert_allclose(pose, [1, 0, 0, 0, *scenario.master.position], atol=1e-12)
-    assert scenario.master.without_coulomb_friction().leader.friction == []
+    assert scenario.master.without_coulomb_friction_and_encoder_steps().leader.friction == []
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_sdf_has_the_limits_of_the_device(plant):
     independent = [0, 1, 3, 4, 5]
     np.testing.assert_allclose(lower[independent], phantom.JOINT_LOWER_RAD[independent], atol=1e-6)
     np.testing.assert_allclose(upper[independent], phantom.JOINT_UPPER_RAD[independent], atol=1e-6)
-    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.FIVE_BAR_RANGE_RAD, atol=1e-6)
+    np.testing.assert_allclose([-upper[2], -lower[2]], phantom.Q2_MINUS_Q3_RANGE_RAD, atol=1e-6)
     np.testing.assert_allclose(
         plant.GetEffortUpperLimits()[3:], phantom.PEAK_WRIST_TORQUES_N_M, atol=1e-12
     )

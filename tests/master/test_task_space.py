@@ -11,7 +11,7 @@ from pydrake.math import RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import dynamics
-from drake_teleop.station.master.data_sheets import FIGURES, JointFriction, Master
+from drake_teleop.station.master.data_sheets import FIGURES, Master, PhantomJointFriction
 from drake_teleop.station.master.device import MasterDevice
 from drake_teleop.station.master.electronics import encoder_pose_into
 from drake_teleop.station.master.force_display import initial_display_state, step_display
@@ -123,9 +123,9 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
     wobbling = inside + 1e-3 * np.eye(6)[5]
     for model, ends in ((fixed, [False, False, True]), (omega, [False, False, True])):
         np.testing.assert_array_equal(
-            model.is_at_end_stop(np.array([inside, wobbling, aside])), ends
+            model.is_any_axis_at_end_stop(np.array([inside, wobbling, aside])), ends
         )
-    np.testing.assert_array_equal(omega.is_at_end_stop(np.array([turned])), [True])
+    np.testing.assert_array_equal(omega.is_any_axis_at_end_stop(np.array([turned])), [True])
     for pose in (aside, turned):
         with pytest.raises(DrakeTeleopError, match="the device's workspace is"):
             omega.inverse_kinematics(omega.forward_kinematics(pose))
@@ -166,7 +166,7 @@ def test_file_selects_device_and_overrides_figures():
         DrakeTeleopError, match=r"master\.figures.*friction stops the haptic device"
     ):
         MasterDevice(PERIOD, device(friction=50.0), np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0]))
-    assert JointFriction() == Master().friction
+    assert PhantomJointFriction() == Master().friction
 
 
 @pytest.mark.parametrize("model", ["geomagic_touch", "omega_6"])
@@ -199,7 +199,7 @@ def test_encoders_count_whole_steps_from_the_start():
 
 @pytest.mark.parametrize("model", FIGURES)
 def test_device_without_dry_friction_has_no_encoder_steps(model):
-    master = Master(model=model).without_coulomb_friction()
+    master = Master(model=model).without_coulomb_friction_and_encoder_steps()
     assert not master.encoder_steps().any()
     assert not master.device(0.0, 0.0).parameters.dry_friction.any()
     assert master.device(0.0, 0.0).parameters.damping.all()
@@ -218,8 +218,8 @@ def test_slow_device_holds_reading_and_force_at_its_rate():
         simulation__duration=0.04,
         force_scaling__sigma=1.0,
     )
-    assert scenario.master.sampling_period(2000.0) == 2e-3
-    assert scenario.master.sampling_period(500.0) is None
+    assert scenario.master.sampling_period_if_slower_than_hand(2000.0) == 2e-3
+    assert scenario.master.sampling_period_if_slower_than_hand(500.0) is None
     result = simulate(MakeTeleopStation(scenario), scenario.simulation, progress=False)
     for values in (result["pose_command"][:, 4:], result["force_to_master"][:, :3]):
         changes = np.flatnonzero(np.diff(values, axis=0).any(axis=1))

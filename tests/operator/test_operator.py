@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import device, phantom
-from drake_teleop.station.master.data_sheets import JointFriction, Master
+from drake_teleop.station.master.data_sheets import Master, PhantomJointFriction
 from drake_teleop.station.master.force_display import ForceDisplay
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
@@ -155,7 +155,7 @@ def test_hand_force_and_torque_are_limited():
 def test_hand_yields_to_the_displayed_force(grip):
     """The hand at rest deflects by F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
-    viscous = JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
+    viscous = PhantomJointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
     config = OperatorConfig(grip=grip)
     hand = config.hand
     model = Master(friction=viscous).device(hand.mass, hand.inertia)

@@ -12,7 +12,7 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.station import master_side
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.master.data_sheets import JointFriction
+from drake_teleop.station.master.data_sheets import PhantomJointFriction
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator.decision import (
     OUTCOME_INDEX,
@@ -27,12 +27,23 @@ from drake_teleop.station.operator.perception import (
     Perception,
     perceive_contact,
 )
-from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_distance
+from drake_teleop.station.operator.task import (
+    Insert,
+    Movement,
+    Press,
+    Reach,
+    Touch,
+    check_target_beyond_standoff,
+)
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import contact_force, detection_delay, task_measures
+from drake_teleop.station.task_measures import (
+    detection_delay,
+    task_measures,
+    true_contact_force_magnitudes,
+)
 
 #: Rates of a study: the operator notices no difference.
 FAST = {
@@ -110,12 +121,14 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     person = decision.pack_operator_parameters(training, Perception(), Movement())
     # In Python, to avoid compilation.
     monkeypatch.setattr(
-        decision, "_contact_force_against_axis", decision._contact_force_against_axis.py_func
+        decision,
+        "_contact_force_at_tool_along_approach",
+        decision._contact_force_at_tool_along_approach.py_func,
     )
     force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
     packed, felt = decision.pack_task_parameters(task), 0.3 * R_WB.T @ force_W
     axis = np.array(task.translation) / np.linalg.norm(task.translation)
-    assert decision._contact_force_against_axis(packed, person, felt) == pytest.approx(
+    assert decision._contact_force_at_tool_along_approach(packed, person, felt) == pytest.approx(
         -force_W @ axis
     )
     size = decision._lateral_force_into.py_func(packed, person, felt, across)
@@ -186,7 +199,7 @@ def test_hand_stops_after_contact_detection(touch):
         assert 0.16 < measures["detection_time_s"] < 0.5
         assert measures["false_notices"] == 0
         # It has stopped: the motion of the tool in the leaf is constant.
-        force = contact_force(result)
+        force = true_contact_force_magnitudes(result)
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
         # It decelerates, and rests for 0.3 s, the default.
         stopping = result.t[result["task_state"][:, PHASE_INDEX] == PHASE_STOPPING]
@@ -231,7 +244,7 @@ def test_operator_gives_up_without_contact():
 @pytest.mark.slow
 def test_set_force_is_held():
     """Device friction, which hides 1 N at the tool, is zero."""
-    smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
+    smooth = {"master__friction": PhantomJointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
     task = Press(translation=[0.0, 0.0, -0.08], force=12.0, tolerance=1.2)
     _, measures = run("press", **with_task(task, **smooth), force_scaling__gamma=1.6)
     assert measures["task_time_s"] < 5.5
@@ -262,7 +275,7 @@ def test_papers_contact_is_detected_without_false_detection():
         ]
         > 0.0
     )
-    touching = contact_force(result) > 0.0
+    touching = true_contact_force_magnitudes(result) > 0.0
     assert not noticed[: np.argmax(touching)].any()
     assert detection_delay(result.t, touching, noticed) < 0.03
 
@@ -323,9 +336,9 @@ def test_impossible_task_is_rejected(changes, message):
 
 
 def test_target_beyond_its_radius_is_accepted():
-    check_distance(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
+    check_target_beyond_standoff(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
     with pytest.raises(DrakeTeleopError, match=r"not above 0\.02 m"):
-        check_distance(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
+        check_target_beyond_standoff(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 
 def test_measures_need_a_task(reach):

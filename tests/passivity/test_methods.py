@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.config import check_ranges
+from drake_teleop.common.config import check_all_field_values
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import normalized_quaternion, quaternion_product, rotate_vector
 from drake_teleop.lab.comparison.one_dof import (
@@ -20,13 +20,13 @@ from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     MEMORY_SIZE,
-    MOTION_SCALE,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
     SLAVE_MASS,
+    SLAVE_PER_MASTER_MOTION,
     STORED_ENERGY,
     WRENCH_LIMIT,
 )
@@ -258,7 +258,7 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
     np.testing.assert_allclose(p[_HAND_WRENCH_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
     for part, values in ((SERVO_K, (11, 12)), (SERVO_D, (13, 14)), (SLAVE_MASS, (15, 16))):
         np.testing.assert_allclose(p[part] / power, values)
-    np.testing.assert_array_equal(p[MOTION_SCALE], motion)
+    np.testing.assert_array_equal(p[SLAVE_PER_MASTER_MOTION], motion)
 
 
 def test_limits_are_those_of_the_default_device_unless_given():
@@ -271,7 +271,7 @@ def test_unknown_method_is_rejected():
     with pytest.raises(DrakeTeleopError, match="there is no passivity method 'waves'"):
         initial_method_memory("waves", np.zeros(1), START)
     with pytest.raises(DrakeTeleopError, match="method"):
-        check_ranges(PassivityConfig(method="waves"), "passivity")
+        check_all_field_values(PassivityConfig(method="waves"), "passivity")
     assert initial_method_memory("none", np.zeros(1), START).shape == (MEMORY_SIZE,)
 
 
@@ -315,7 +315,7 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
         np.zeros(6),
     )
     received = packet.copy()
-    received[WRENCH][1] = memory[LAST_WRENCH][1] = 3.0
+    received[WRENCH][1] = memory[LAST_PORT_WRENCH][1] = 3.0
     memory[STORED_ENERGY][0] = stored
     dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
     master_step(

@@ -9,7 +9,7 @@ from drake_teleop.station.passivity import pspm
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
     STORED_ENERGY,
@@ -153,7 +153,7 @@ def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     move_pose_into(pose, asked, wanted)
     move_pose_into(pose, left, command)
     pspm.record_command.py_func(wanted, command, pose, twist, p, memory)
-    np.testing.assert_allclose(memory[LAST_WRENCH], K * left - D * twist, rtol=1e-9)
+    np.testing.assert_allclose(memory[LAST_PORT_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))
     np.testing.assert_allclose(memory[STORED_ENERGY], before - more, rtol=1e-9)

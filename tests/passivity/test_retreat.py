@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import LAST_WRENCH, MEMORY_SIZE
+from drake_teleop.station.passivity.memory import LAST_PORT_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
 from drake_teleop.station.passivity.safe_state import fade_retreat_wrench
 
@@ -42,7 +42,7 @@ def test_only_wrench_along_a_fast_hand_fades():
         fade_retreat_wrench(before, 1.0, p, memory, wrench)  # a long step: no filtering
         wrench[:] = given
         fade_retreat_wrench(now, 1e-9, p, memory, wrench)
-        np.testing.assert_array_equal(memory[LAST_WRENCH], wrench)
+        np.testing.assert_array_equal(memory[LAST_PORT_WRENCH], wrench)
         return np.array([wrench[:3] @ along[:3], wrench[3:] @ along[3:]])
 
     for speed, share in ((-9.0, 1.0), (0.99, 1.0), (1.5, 0.5), (2.0, 0.0), (9.0, 0.0)):

@@ -10,9 +10,9 @@ import pytest
 
 from drake_teleop.common.style import Picture
 from drake_teleop.lab.reproduction.experiments import (
-    identification_values,
-    raw_force_beyond_free_range,
-    true_parameters,
+    errors_of_identification,
+    largest_raw_force_beyond_free_range,
+    true_offsets_and_phi,
 )
 from drake_teleop.lab.reproduction.report import (
     Comparison,
@@ -162,7 +162,7 @@ def test_text_is_escaped(tmp_path):
 def test_errors_of_the_identified_load_are_those_of_its_parameters():
     """The estimated tool is 1 % too heavy; its centre of mass is 3 and 4 mm off."""
     scenario = LoadScenario("free_motion_force")
-    truth = true_parameters(scenario)
+    truth = true_offsets_and_phi(scenario)
     estimate = truth.copy()
     estimate[6] *= 1.01
     estimate[7:10] = 1.01 * truth[7:10] + estimate[6] * np.array([3e-3, 0.0, -4e-3])
@@ -171,11 +171,11 @@ def test_errors_of_the_identified_load_are_those_of_its_parameters():
     load = SimpleNamespace(
         estimate=estimate,
         batch=SimpleNamespace(standard_deviations=np.full(16, 0.01), samples=7),
-        recursive_against_batch=0.0,
+        max_recursive_minus_batch_in_stds=0.0,
         kappa_w10=5.0,
         trajectory=SimpleNamespace(period=8.0),
     )
-    found = identification_values(load, scenario)
+    found = errors_of_identification(load, scenario)
     assert found["mass_error_percent"] == pytest.approx(1.0)
     assert found["com_error_mm"] == pytest.approx(5.0)
     assert found["inertia_error_max_g_m2"] == pytest.approx(0.2)
@@ -194,6 +194,6 @@ def test_raw_force_is_beyond_its_free_range_on_either_side():
         measured_wrench=measured,
         measured_wrench_free=free,
     )
-    beyond = raw_force_beyond_free_range(run)
+    beyond = largest_raw_force_beyond_free_range(run)
     np.testing.assert_allclose(beyond[:2], [0.5, 0.75])
     assert beyond[2] < 0.0

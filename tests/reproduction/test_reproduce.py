@@ -18,12 +18,12 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction import experiments, reproduce
 from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
-    ContactMotion,
-    contact_values,
-    free_values,
-    ideal_values,
-    raw_force_beyond_free_range,
+    RunsWithAndWithoutContact,
+    detection_and_peaks_of_contact_run,
+    largest_raw_force_beyond_free_range,
+    peaks_and_residuals_of_free_run,
     simulate_free_motion,
+    wrench_errors_of_ideal_run,
 )
 from drake_teleop.lab.reproduction.report import (
     compare_with_paper,
@@ -206,7 +206,7 @@ def force(*components: float) -> np.ndarray:
 
 
 @pytest.fixture
-def motion() -> ContactMotion:
+def motion() -> RunsWithAndWithoutContact:
     """Return 100 N of motion and 15 N of contact at 0.22 s, at 2 kHz, with 0.5 N of noise."""
     t = np.arange(0.0, 0.8, 5e-4)
     free = np.zeros((len(t), 6))
@@ -218,7 +218,7 @@ def motion() -> ContactMotion:
     result = SimulationResult(
         t, {spec.name: touch, sheet.name: np.zeros((len(t), 2))}, [spec, sheet]
     )
-    return ContactMotion(
+    return RunsWithAndWithoutContact(
         scenario=LoadScenario("contact_transition"),
         contact_result=result,
         free_result=result,
@@ -232,10 +232,10 @@ def motion() -> ContactMotion:
 
 
 def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
-    figures = contact_values(motion)
+    figures = detection_and_peaks_of_contact_run(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
-    assert np.all(raw_force_beyond_free_range(motion) <= 0)
+    assert np.all(largest_raw_force_beyond_free_range(motion) <= 0)
     assert figures["false_alarm_0_6_s"] is False
     assert figures["duration_s"] == pytest.approx(0.04)
 
@@ -244,7 +244,7 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
 def test_raw_force_detects_contact_by_any_axis(motion, axis):
     told = motion.measured_wrench.copy()
     told[motion.in_contact, axis] += 180.0
-    figures = contact_values(dataclasses.replace(motion, measured_wrench=told))
+    figures = detection_and_peaks_of_contact_run(dataclasses.replace(motion, measured_wrench=told))
     assert figures["raw_detectable"] is True
 
 
@@ -253,7 +253,7 @@ def test_raw_force_detects_contact_by_its_norm(motion):
     free, told = motion.measured_wrench_free.copy(), motion.measured_wrench.copy()
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.in_contact, 0] = 80.0
-    excess = raw_force_beyond_free_range(
+    excess = largest_raw_force_beyond_free_range(
         dataclasses.replace(motion, measured_wrench=told, measured_wrench_free=free)
     )
     assert np.all(excess[:3] <= 0)
@@ -263,13 +263,15 @@ def test_raw_force_detects_contact_by_its_norm(motion):
 def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
     calculated = motion.calculated_wrench.copy()
     calculated[np.argmin(np.abs(motion.contact_result.t - 0.6)), 2] = 2.0
-    figures = contact_values(dataclasses.replace(motion, calculated_wrench=calculated))
+    figures = detection_and_peaks_of_contact_run(
+        dataclasses.replace(motion, calculated_wrench=calculated)
+    )
     assert figures["false_alarm_0_6_s"] is True
 
 
 def test_contact_is_not_detected_without_elimination(motion):
     largest = 1.5 * np.abs(motion.measured_wrench_free[:, 2]).max()
-    figures = contact_values(
+    figures = detection_and_peaks_of_contact_run(
         dataclasses.replace(motion, calculated_wrench=motion.measured_wrench, threshold_N=largest)
     )
     assert figures["detected_s"] is None
@@ -278,7 +280,7 @@ def test_contact_is_not_detected_without_elimination(motion):
 
 def test_contact_time_is_null_without_contact(motion):
     nothing = np.zeros(len(motion.contact_result.t), dtype=bool)
-    figures = contact_values(
+    figures = detection_and_peaks_of_contact_run(
         dataclasses.replace(
             motion, in_contact=nothing, calculated_wrench=motion.calculated_wrench_free
         )
@@ -331,7 +333,7 @@ def ideal_rows(values):
 
 
 def test_elimination_removes_the_reaction_force_of_the_plant(ideal_run):
-    values = ideal_values(ideal_run)
+    values = wrench_errors_of_ideal_run(ideal_run)
     assert 0 < values["residual_max_N"] < 1e-11
     assert 0 < values["residual_max_Nm"] < 1e-12
     assert ideal_rows(values) == [True, True]
@@ -350,10 +352,10 @@ def test_ideal_run_rejects_each_wrong_sign_of_the_regressor(ideal_run, monkeypat
         mutated = per_sample(into)
         with monkeypatch.context() as patch:
             patch.setattr(experiments, "regressor", mutated)
-            assert False in ideal_rows(ideal_values(run)), place
+            assert False in ideal_rows(wrench_errors_of_ideal_run(run)), place
         with monkeypatch.context() as patch:
             patch.setattr(experiments, "contact_wrench", partial(eliminate, mutated))
-            assert False in ideal_rows(ideal_values(run)), place
+            assert False in ideal_rows(wrench_errors_of_ideal_run(run)), place
 
 
 def test_reproduce_exits_with_status_1_for_a_wrong_sign(
@@ -379,6 +381,6 @@ def test_wrong_mass_increases_the_residual():
     estimate[6:] *= 1.1
     motion = simulate_free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled_wrenches) == SIGMAS
-    figures = free_values(motion, 2, "N")
+    figures = peaks_and_residuals_of_free_run(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

@@ -25,9 +25,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
+    display_values_of_required_entries,
     parse_tolerance,
-    required_values,
-    tolerances_in_units,
+    tolerances_in_display_units,
 )
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
@@ -96,8 +96,10 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     )
     again = identify_log(path).identification
     np.testing.assert_array_equal(last.identified_log.identification.phi, again.phi)
-    error = required_values(TOLERANCE, again.phi) - required_values(TOLERANCE, PHI)
-    assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
+    error = display_values_of_required_entries(
+        TOLERANCE, again.phi
+    ) - display_values_of_required_entries(TOLERANCE, PHI)
+    assert (np.abs(error) < tolerances_in_display_units(TOLERANCE, PHI)).all()
     assert last.record_length_s == pytest.approx(identify_log(path).log.t[-1])
 
 
@@ -281,7 +283,7 @@ def test_variance_of_few_degrees_of_freedom_is_not_sufficient(
 ) -> None:
     widths = np.array([0.5]), np.array([0.9]), np.array([degrees])
     monkeypatch.setattr(
-        "drake_teleop.robots.calibration.half_widths_over_tolerances", lambda *_: widths
+        "drake_teleop.robots.calibration.half_widths_and_dof_over_tolerances", lambda *_: widths
     )
     at = evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.parquet")
     assert at.is_within_tolerance.tolist() == [known]
@@ -350,8 +352,10 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     recorder.write(tmp_path / recorder.log_file_name)
     found = identify_log(tmp_path / recorder.log_file_name)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
-    error = required_values(TOLERANCE, found.identification.phi) - required_values(TOLERANCE, PHI)
-    assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
+    error = display_values_of_required_entries(
+        TOLERANCE, found.identification.phi
+    ) - display_values_of_required_entries(TOLERANCE, PHI)
+    assert (np.abs(error) < tolerances_in_display_units(TOLERANCE, PHI)).all()
 
 
 @pytest.mark.long
@@ -373,5 +377,7 @@ def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) 
     assert summary["all_known"] and summary["seconds"] < 8.0
     asked = parse_tolerance("mass 1 %, com 1 mm")
     phi = json.loads((tmp_path / "out" / "identification.json").read_text())["phi"]
-    error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
-    assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()
+    error = display_values_of_required_entries(
+        asked, np.array(phi)
+    ) - display_values_of_required_entries(asked, PHI)
+    assert (np.abs(error) < tolerances_in_display_units(asked, PHI)).all()

@@ -211,7 +211,7 @@ def test_failing_explanation_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPa
     def fail(rows: Values, dt: float) -> list[tuple[float, str]]:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(changes, "find_changes", fail)
+    monkeypatch.setattr(changes, "find_zero_and_load_changes", fail)
     values = stream(seconds=8.0)
     tare(values, round(4.0 / DT))
     out, messages = compensated(values)

@@ -13,7 +13,7 @@ from drake_teleop.robots.assembly import (
     DELAY_SAMPLE_PERIOD_S,
     DelayTracker,
     ReadingAssembler,
-    ReadingStreams,
+    WrenchAndMotionStreams,
 )
 from drake_teleop.robots.streams import POSE, WRENCH
 
@@ -102,7 +102,9 @@ def test_delay_is_constant_at_rest() -> None:
 
 def test_assembly_tracks_an_unknown_delay() -> None:
     """Poses are stamped 4 ms late."""
-    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, track=load())
+    assembly = ReadingAssembler(
+        WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, track=load()
+    )
     good = [each for each in played(assembly, 1.6, later=0.004) if not each.flags]
     assert assembly.delay_s == pytest.approx(0.004, abs=2e-4)
     assert good[-1].t > 1.6 - 0.035 - WRENCH_DT

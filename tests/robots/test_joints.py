@@ -20,13 +20,21 @@ from test_reading_assembly import StreamStub
 from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import parse_tolerance, required_values, tolerances_in_units
-from drake_teleop.robots.assembly import PoseSourceFromJoints, ReadingAssembler, ReadingStreams
+from drake_teleop.load.tolerance import (
+    display_values_of_required_entries,
+    parse_tolerance,
+    tolerances_in_display_units,
+)
+from drake_teleop.robots.assembly import (
+    PoseSourceFromJoints,
+    ReadingAssembler,
+    WrenchAndMotionStreams,
+)
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Reading
 from drake_teleop.station.slave.arm import sensor_motion
-from drake_teleop.station.slave.plant import read_arm_kinematics
+from drake_teleop.station.slave.plant import read_arm_without_default_limits
 
 DT = 0.002
 NAMES = ("lift", "bend", "roll", "yaw")
@@ -76,7 +84,7 @@ def motion_of(table: np.ndarray, joints: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def test_pose_equals_drake(model: Path) -> None:
-    arm = read_arm_kinematics(model, "tool")
+    arm = read_arm_without_default_limits(model, "tool")
     assert arm is not None and arm.joint_names == NAMES
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(model))
@@ -112,7 +120,7 @@ class JointSource(StreamStub):
 
 
 def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
-    arm = read_arm_kinematics(model, "tool")
+    arm = read_arm_without_default_limits(model, "tool")
     assert arm is not None
     t, *joints = moved(0.4)
     bad = Reading(0, 0.0, np.zeros(7), stream=POSE), Reading(0, 0.0, np.full(3, 0.1), stream=JOINTS)
@@ -121,7 +129,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = ReadingAssembler(ReadingStreams(source)), []
+    assembly, found = ReadingAssembler(WrenchAndMotionStreams(source)), []
     for k, part in enumerate(sent[1:]):
         wrench = Reading(k, part.t, np.zeros(6), stream=WRENCH, arrival=part.t)
         for each in (part._replace(arrival=part.t), wrench):
@@ -135,7 +143,10 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
 
 
 def test_options_for_joints_are_checked_together(model: Path) -> None:
-    arm, address = read_arm_kinematics(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
+    arm, address = (
+        read_arm_without_default_limits(model, "tool"),
+        "zenoh://127.0.0.1/ft?joints=/joint_states",
+    )
     with pytest.raises(DrakeTeleopError, match="joint positions need the model of the arm"):
         open_source(address, None, rate_hz=500.0)
     with pytest.raises(DrakeTeleopError, match="delivers no joint positions for --model"):
@@ -149,7 +160,7 @@ def test_options_for_joints_are_checked_together(model: Path) -> None:
 @pytest.mark.parametrize("box", ["netft", "zenoh"])
 def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_path: Path) -> None:
     """Wrench by either protocol and joints by ROS 2 come from other processes."""
-    arm = read_arm_kinematics(model, "tool")
+    arm = read_arm_without_default_limits(model, "tool")
     assert arm is not None
     _, *joints = moved(40.0)
     motion = np.split(motion_of(arm.table, tuple(joints)), 3, axis=1)
@@ -170,5 +181,7 @@ def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_
     assert known.return_value == 0, known.output
     asked = parse_tolerance("mass 2 %, com 2 mm")
     phi = json.loads((tmp_path / "identification.json").read_text())["phi"]
-    error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
-    assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()
+    error = display_values_of_required_entries(
+        asked, np.array(phi)
+    ) - display_values_of_required_entries(asked, PHI)
+    assert (np.abs(error) < tolerances_in_display_units(asked, PHI)).all()

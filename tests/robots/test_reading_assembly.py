@@ -14,7 +14,7 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.assembly import (
     ReadingAssembler,
-    ReadingStreams,
+    WrenchAndMotionStreams,
     _StreamClockOffset,
     pose_from_rpy,
 )
@@ -87,7 +87,9 @@ def played(
 @pytest.mark.parametrize("lost", [lambda k: False, lambda k: k % 14 == 0])
 def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
     found = played(
-        ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost
+        ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS),
+        0.4,
+        lost=lost,
     )
     good = [each for each in found if not each.flags]
     assert len(good) > 200 and good[-1].t > 0.4 - 0.035  # half a window late
@@ -105,7 +107,7 @@ def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
 def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
     """The removed weight has the same orientation, so that only mass times acceleration remains."""
     assembly = ReadingAssembler(
-        ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, weight_removed=True
+        WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, weight_removed=True
     )
     found = [each for each in played(assembly, 0.4) if not each.flags]
     rest, left = np.zeros(3), []
@@ -116,20 +118,22 @@ def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
         left.append(each.values[:6] - weight - OFFSETS - non_contact_wrench(*motion, PHI))
     assert len(left) > 200 and np.abs(left).max() < 0.03
     with pytest.raises(DrakeTeleopError, match="without an orientation"):
-        ReadingAssembler(ReadingStreams(StreamStub(WRENCH, IMU)), weight_removed=True)
+        ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, IMU)), weight_removed=True)
     weightless = dataclasses.replace(load(), weight_removed=True)
     with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
         open_source("udp://:0", weightless, rate_hz=500.0)
 
 
 def test_motion_on_another_clock_is_synchronised() -> None:
-    apart = ReadingAssembler(ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
-    same = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    apart = ReadingAssembler(
+        WrenchAndMotionStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS
+    )
+    same = ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
     good = [each.values for each in a if not each.flags], [x.values for x in b if not x.flags]
     np.testing.assert_allclose(good[0][-150:], good[1][-150:], atol=1e-4)
     late = ReadingAssembler(
-        ReadingStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
+        WrenchAndMotionStreams(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01
     )
     assert [same.lag_s, late.lag_s] == pytest.approx([0.5 * 1.8 / 30.0, 0.5 * 1.8 / 30.0 + 0.01])
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
@@ -144,7 +148,7 @@ def test_offset_of_a_slow_clock_increases() -> None:
 
 
 def test_readings_are_stale_without_poses_and_recover() -> None:
-    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
     assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
     assert {each.flags for each in found} == {0, int(ReadingFlag.STALE)}
@@ -152,7 +156,7 @@ def test_readings_are_stale_without_poses_and_recover() -> None:
 
 
 def test_invalid_and_out_of_order_poses_are_ignored() -> None:
-    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     played(assembly, 0.3)
     for values, t in (
         (np.full(7, math.nan), 0.3),
@@ -170,7 +174,7 @@ def test_invalid_and_out_of_order_poses_are_ignored() -> None:
 
 
 def test_assembly_accepts_a_clock_that_is_set_back() -> None:
-    assembly = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
+    assembly = ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     compensator = Compensator(load(), DT)
     for each in played(assembly, 0.2):
         compensator.step(each, each.t + 0.03)
@@ -191,7 +195,7 @@ def test_assembly_accepts_a_clock_that_is_set_back() -> None:
 
 
 def test_imu_gives_the_motion() -> None:
-    assembly, found = ReadingAssembler(ReadingStreams(StreamStub(WRENCH, IMU))), []
+    assembly, found = ReadingAssembler(WrenchAndMotionStreams(StreamStub(WRENCH, IMU))), []
     for k in range(250):
         t = k * DT
         found += assembly.readings_completed_by(
@@ -206,7 +210,7 @@ def test_imu_gives_the_motion() -> None:
 
 def test_wrench_without_motion_is_refused() -> None:
     with pytest.raises(DrakeTeleopError, match=r"^ros2://ft: delivers no motion; give --motion"):
-        ReadingStreams(StreamStub(WRENCH), where="ros2://ft")
+        WrenchAndMotionStreams(StreamStub(WRENCH), where="ros2://ft")
 
 
 def test_log_is_not_recommended_as_source_of_the_motion_alone() -> None:

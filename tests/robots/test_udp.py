@@ -24,7 +24,11 @@ from test_compensator import DT, load, readings
 import drake_teleop.robots.udp as udp
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
-from drake_teleop.common.interruption import INTERRUPTED_EVENT, delayed_signals, install_handlers
+from drake_teleop.common.interruption import (
+    INTERRUPTED_EVENT,
+    delayed_signals,
+    install_interrupt_handlers,
+)
 from drake_teleop.robots import lines
 from drake_teleop.robots.compensate import (
     TareRequestPort,
@@ -199,11 +203,11 @@ def test_ignored_sigint_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = {signal.SIGINT: signal.SIG_IGN}
     monkeypatch.setattr(signal, "signal", installed.__setitem__)
     monkeypatch.setattr(signal, "getsignal", installed.get)
-    install_handlers()
+    install_interrupt_handlers()
     assert installed.keys() == {signal.SIGINT, signal.SIGTERM}
     assert installed[signal.SIGINT] is signal.SIG_IGN
     installed[signal.SIGINT] = signal.default_int_handler
-    install_handlers()
+    install_interrupt_handlers()
     assert installed[signal.SIGINT] is installed[signal.SIGTERM]
 
 
@@ -356,7 +360,7 @@ class SignalLosingSource(InterruptedSource):
 @pytest.fixture
 def handlers() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    install_handlers()
+    install_interrupt_handlers()
     yield
     INTERRUPTED_EVENT.clear()
     for number, handler in before.items():

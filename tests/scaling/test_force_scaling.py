@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.scaling.force_scaling import ForceScaling, ForceScalingConfig
-from drake_teleop.station.slave.arm import sensor_acceleration_into
+from drake_teleop.station.slave.arm import acceleration_from_specific_force_into
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -94,7 +94,7 @@ Q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 def weight_wrench(arm, phi) -> np.ndarray:
     """Return the wrench V(-g) phi in the pose of `outputs`."""
     gravity = np.empty(3)
-    sensor_acceleration_into(arm.table, Q, np.zeros(3), gravity)
+    acceleration_from_specific_force_into(arm.table, Q, np.zeros(3), gravity)
     assert np.linalg.norm(gravity) == pytest.approx(9.81, rel=1e-3)
     return non_contact_wrench(-gravity, np.zeros(3), np.zeros(3), phi)
 

@@ -203,7 +203,7 @@ def test_samples_in_contact_wait_for_new_torque_or_noise():
     sensor: Any = SimpleNamespace(
         _period=period, _event_periods=(5 * period, SAMPLES_PER_NOISE_BLOCK * period)
     )
-    due = [WristSensor._are_samples_due(sensor, time) for time in k * period / 3]
+    due = [WristSensor._is_torque_or_noise_update_time(sensor, time) for time in k * period / 3]
     np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * SAMPLES_PER_NOISE_BLOCK) == 0))
 
 

@@ -10,10 +10,18 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.home import check_holding_torque, find_start_posture, home_posture
+from drake_teleop.station.slave.home import (
+    check_inertia_and_holding_torque,
+    find_start_posture,
+    home_posture,
+)
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
+from drake_teleop.station.slave.plant import (
+    NominalSlave,
+    ParseSlave,
+    finalize_without_limit_warnings,
+)
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
@@ -86,9 +94,9 @@ def read(slave):
     slave.check("slave")
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
-    finalize_plant(plant)
+    finalize_without_limit_warnings(plant)
     model, assumed = parsed.arm()
-    check_holding_torque(model, find_start_posture(slave, model))
+    check_inertia_and_holding_torque(model, find_start_posture(slave, model))
     return [*parsed.assumptions, *assumed]
 
 

@@ -8,7 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_friction import FRICTION_TANH_SPEED
+from drake_teleop.station.slave.joint_friction import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
@@ -48,7 +48,7 @@ def arm():
     return Arm(FRICTION)
 
 
-@pytest.mark.parametrize("speed", [0.3 * FRICTION_TANH_SPEED, 0.4])
+@pytest.mark.parametrize("speed", [0.3 * ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, 0.4])
 def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
     """Computed torque does not compensate the friction."""
     random, table = np.random.default_rng(3), arm.slave.arm.table

@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model import model_references
 from drake_teleop.station.slave.model.model_references import ModelFiles, list_model_files
-from drake_teleop.station.slave.models import ParsedModel, ParseModel
+from drake_teleop.station.slave.models import ParsedArm, ParseModel
 
 SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 LINK = """<link name="l"><inertial><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz>
@@ -27,7 +27,7 @@ iyy="1" iyz="0" izz="1"/></inertial><visual><geometry><mesh filename="{mesh}"/><
 OUTSIDE = "outside the model's folder"
 
 
-def parse(path: Path, packages: tuple[Path, ...] = ()) -> ParsedModel:
+def parse(path: Path, packages: tuple[Path, ...] = ()) -> ParsedArm:
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     found = ParseModel(plant, path, "l", packages)
     plant.Finalize()

@@ -22,7 +22,7 @@ from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     nearest_possible_inertia,
-    repair_inertia,
+    repair_inertia_and_detect_missing,
 )
 from drake_teleop.station.slave.model.repair_report import RepairReport
 from drake_teleop.station.slave.model.urdf_repair import _has_valid_colour, find_dependence_reasons
@@ -450,7 +450,7 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
         report = RepairReport()
         link = ElementTree.fromstring(f'<link name="l">{text}{"</inertial>" * (k > 1)}</link>')
         check_lengths_and_inertias(link, "link l", report)
-        repair_inertia(link, report, is_sdf=False, at_rest=False)
+        repair_inertia_and_detect_missing(link, report, is_sdf=False, at_rest=False)
         if allowed and not (k == 2 and value[0] == "-"):
             report.raise_faults(tmp_path)
         else:
@@ -487,7 +487,7 @@ def test_products_of_inertia_are_kept(izz, is_sdf):
         words = " ".join(f'{name}="{value}"' for name, value in entries.items())
         text = f'<mass value="2"/><inertia {words}/>'
     link = ElementTree.fromstring(f'<link name="l"><inertial>{text}</inertial></link>')
-    repair_inertia(link, RepairReport(), is_sdf=is_sdf, at_rest=False)
+    repair_inertia_and_detect_missing(link, RepairReport(), is_sdf=is_sdf, at_rest=False)
     element = link.find("inertial/inertia")
     nearest, change = nearest_possible_inertia(inertia)
     assert (change > 0.0) == (izz == 0.09)

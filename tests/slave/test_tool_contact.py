@@ -10,11 +10,14 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import FindContactPairs, min_distance_of_boxes
+from drake_teleop.station.environment.point_contact import (
+    FindContactPairs,
+    lower_bound_of_box_distance,
+)
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.plant_dynamics import environment_wrench
+from drake_teleop.station.slave.plant_dynamics import environment_wrench_about_Wo_into
 from drake_teleop.station.slave.slave_config import Slave
 
 
@@ -54,7 +57,7 @@ def test_wrench_equals_drakes(leaf, most):
         plant.SetPositions(context, slave.contact.leaf_instance, sheet[:1])
         plant.SetVelocities(context, slave.contact.leaf_instance, sheet[1:])
         expected = drake_wrench(plant, context, slave.tool)
-        environment_wrench(
+        environment_wrench_about_Wo_into(
             slave.arm.table,
             slave.contact.compiled_pairs,
             slave.contact.joint_table,
@@ -87,7 +90,7 @@ def test_peg_in_slot_equals_drakes_with_many_pairs():
         plant.SetVelocities(context, slave.instance, v)
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
-        environment_wrench(
+        environment_wrench_about_Wo_into(
             slave.arm.table,
             slave.contact.compiled_pairs,
             slave.contact.joint_table,
@@ -108,7 +111,7 @@ def test_applied_wrench_is_shifted_to_world_origin():
     slave = AddSlavePlant(DiagramBuilder(), Slave(position=[0.55, 0.0, 0.36]), None)
     push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
-    environment_wrench(
+    environment_wrench_about_Wo_into(
         slave.arm.table,
         slave.contact.compiled_pairs,
         slave.contact.joint_table,
@@ -172,7 +175,7 @@ def test_distance_of_separate_boxes():
         rest = [moved.rotation().matrix().ravel(), moved.translation(), half[1], leaf, np.zeros(6)]
         own = [X_SOwn.rotation().matrix().ravel(), half[0]]
         pair = np.concatenate([X_SOwn.translation(), [0.0], *rest, *own])
-        found = min_distance_of_boxes(
+        found = lower_bound_of_box_distance(
             pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection
         )
         told = query.Eval(context).ComputeSignedDistancePairClosestPoints(*shapes).distance

@@ -20,10 +20,10 @@ from drake_teleop.lab.comparison.one_dof import RunMeasures
 from drake_teleop.lab.tuning import press_trial, search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
-    GammaSearch,
-    StationTrial,
+    OneAxisGammaSearch,
+    StationPressTrial,
     TunedSettings,
-    press_depth,
+    renderable_press_depth,
     rms_above_hz,
 )
 from drake_teleop.lab.tuning.search import meets_requirements, search_settings
@@ -51,13 +51,13 @@ def test_stated_set_has_all_grips_between_the_given_ones_and_walls_between_the_e
         ("light", 20000.0), ("firm", 20000.0), ("light", 500.0), ("firm", 500.0),
     ]  # fmt: skip
     walls = pytest.approx([20000.0 * 40 ** (-k / 3) for k in range(4)])
-    assert stated.tested_parts == [
+    assert stated.tested_gamma_factors_grips_and_walls == [
         (1.1, ["light"], walls),
         (1.1, ["light"], walls),
         (1.1, ["medium", "firm"], walls),
         (1.0, ["light", "firm"], [20000.0]),
     ]
-    assert make_stated_set(["light"], [3.0], "press").tested_parts == [
+    assert make_stated_set(["light"], [3.0], "press").tested_gamma_factors_grips_and_walls == [
         *(2 * [(1.1, ["light"], [3000.0])]),
         (1.0, ["light"], [3000.0]),
     ]
@@ -126,8 +126,8 @@ def test_rotation_of_the_slave_is_about_the_axes_of_the_world():
 def test_firm_grip_presses_less_deeply_with_a_weak_device():
     strong = LoadScenario("touch")
     weak = replace(strong, master=Master(model="geomagic_touch"))
-    assert press_depth(strong, "firm") == 0.02
-    assert press_depth(weak, "firm") == pytest.approx(0.6 * 3.3 / 700.0)
+    assert renderable_press_depth(strong, "firm") == 0.02
+    assert renderable_press_depth(weak, "firm") == pytest.approx(0.6 * 3.3 / 700.0)
 
 
 def test_only_force_above_5_hz_counts_as_oscillation():
@@ -192,10 +192,12 @@ class FakeStation:
         return rows
 
 
-def trial(walls=(0.5, 20.0), task: str = "press") -> StationTrial:
+def trial(walls=(0.5, 20.0), task: str = "press") -> StationPressTrial:
     given = LoadScenario("contact_transition")
     base = without_task_and_method(given, "internet")
-    return StationTrial(given, base, make_stated_set(["light", "firm"], walls, task), np.ones(16))
+    return StationPressTrial(
+        given, base, make_stated_set(["light", "firm"], walls, task), np.ones(16)
+    )
 
 
 @pytest.mark.parametrize(("task", "margin", "bands"), [("touch", 1.1, 2), ("insert", 1.5, 3)])
@@ -239,7 +241,7 @@ UNEQUAL = Channel(delay=0.02, backward=NetworkConfig(delay=0.05))
 def test_low_pass_of_the_sensor_delays_the_force_alone(monkeypatch):
     monkeypatch.setattr(press_trial, "run_one_dof", capture_arguments)
     one = trial()
-    search_ = GammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
+    search_ = OneAxisGammaSearch(replace(one.base_scenario, channel=UNEQUAL), one.stated_set, {})
     tuned = TunedSettings("ledger", 1.0, 0.3, 100.0)
     with pytest.raises(CapturedArguments) as found:
         search_.share_in_one_axis(AxisParameters(), tuned, 1.5, "firm", 3000.0, 4)

@@ -89,7 +89,7 @@ def _analyze_in_stages(
     if scenario.first_sheet_spring is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.first_sheet_spring)
         pressed = linearize(
-            alone, load_estimate=estimate, displacement=displacement_into_leaf(alone)
+            alone, load_estimate=estimate, displacement=master_displacement_into_leaf(alone)
         )
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
@@ -172,7 +172,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
     )
 
 
-def displacement_into_leaf(scenario: Scenario) -> list[float]:
+def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the master's displacement [m] in its base frame B that bends the leaf by 5 mm."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling

@@ -50,7 +50,7 @@ class CutLoop:
         """Return the loop with these multipliers (..., n) and the crossings of |L| = 1."""
         shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
-        _write_gain_crossings(
+        _gain_crossings_into(
             open_multipliers.reshape(-1, n),
             closed_multipliers.reshape(-1, n),
             _SEARCH_ANGLES_RAD,
@@ -135,7 +135,7 @@ def _response_at(closed, opened, angle, radius):
 
 
 @njit(cache=True)
-def _write_gain_crossings(opened, closed, angles, found):
+def _gain_crossings_into(opened, closed, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, count = opened[n], closed[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
@@ -145,7 +145,9 @@ def _write_gain_crossings(opened, closed, angles, found):
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _add_gain_extremes(_add_pole_angles(angles, poles), poles, zeros)
+        at, values = _angles_with_gain_extremes_and_responses(
+            _add_pole_angles(angles, poles), poles, zeros
+        )
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
@@ -182,7 +184,7 @@ def _add_pole_angles(angles, poles):
 
 
 @njit(cache=True)
-def _add_gain_extremes(angles, poles, zeros):
+def _angles_with_gain_extremes_and_responses(angles, poles, zeros):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _response_at(zeros, poles, angles[i], 1.0)

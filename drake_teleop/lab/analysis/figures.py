@@ -217,7 +217,7 @@ def measure_free_impedance(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
     """Return the impedance displayed in free motion, measured in a simulation without friction."""
-    frictionless = scenario.master.without_coulomb_friction()
+    frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])

@@ -37,7 +37,7 @@ class MultiSine:
     settle: float = 1.5  #: s, for fading in and transients
     seed: int = 0  #: seed of the random phases
 
-    def odd_multiples(self) -> NDArray[np.int64]:
+    def odd_multiples_of_base_rate(self) -> NDArray[np.int64]:
         """Return the frequencies of the motion as odd multiples (n,) of 1 / period."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
@@ -45,7 +45,7 @@ class MultiSine:
 
     def sines_along(self, direction: Array, start: float) -> list[Sine]:
         """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
-        frequencies = self.odd_multiples() / self.period
+        frequencies = self.odd_multiples_of_base_rate() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
         return [
@@ -64,7 +64,7 @@ class MultiSine:
         ]
 
     def _phases_with_lowest_peak(self) -> Array:
-        k = self.odd_multiples()
+        k = self.odd_multiples_of_base_rate()
         draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_NUM_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
         angle = 2 * np.pi * np.outer(u, k)
@@ -146,14 +146,16 @@ def measure_frequency_response(
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
     result = simulate(diagram, drawing.simulation, progress=False)
-    odd_multiples = excitation.odd_multiples()
+    odd_multiples_of_base_rate = excitation.odd_multiples_of_base_rate()
     spectra: dict[str, Complex] = {
-        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, odd_multiples]
+        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[
+            :, odd_multiples_of_base_rate
+        ]
         * (2 / steps)
         for name, signal in _forces_and_velocities_along_task(result, scenario, task).items()
     }
     return StationResponse(
-        np.asarray(2 * np.pi / excitation.period * odd_multiples, dtype=float),
+        np.asarray(2 * np.pi / excitation.period * odd_multiples_of_base_rate, dtype=float),
         spectra,
         scenario.force_scaling.force_scale,
     )

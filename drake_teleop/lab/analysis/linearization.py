@@ -54,9 +54,11 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 # Displacements for differences: errors grow with their square, and with rounding over them.
 _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
-_MAX_COMMANDED_ACCELERATION_RAD_S2 = 20.0  # of a joint: within the motors' torque
-_JOINT_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_MAX_MOTION_PER_PERIOD_AT_REST = 1e-6  # motion per period at rest, relative to the displacements
+_MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
+_JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_RELATIVE_MOTION_PER_PERIOD_AT_REST = (
+    1e-6  # motion per period at rest, relative to the displacements
+)
 _MAX_EQUILIBRIUM_NEWTON_STEPS = 8  # of Newton's method
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
 
@@ -78,7 +80,7 @@ def linearize(
         # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _PeriodSimulator(scenario, load_estimate)
-    x, A, C = period.find_rest_state(np.asarray(displacement, dtype=float))
+    x, A, C = period.find_rest_state_and_derivatives(np.asarray(displacement, dtype=float))
     B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
@@ -174,7 +176,7 @@ class _StateGroup:
 class _PeriodSimulator:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rate_multiples(scenario)
-        own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
+        own_period = scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
                 f"is above the device's own rate of {1 / own_period:g} Hz (must be equal)",
@@ -203,10 +205,12 @@ class _PeriodSimulator:
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
-        self._command_step = min(_ANGLE_STEP, _MAX_COMMANDED_ACCELERATION_RAD_S2 / gain)
+        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 / gain)
         has_contact = smooth.surroundings is not None
         self._joint_step = (
-            min(self._command_step, _JOINT_STEP_IN_CONTACT) if has_contact else self._command_step
+            min(self._command_step, _JOINT_DIFFERENCE_STEP_IN_CONTACT)
+            if has_contact
+            else self._command_step
         )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
@@ -224,7 +228,7 @@ class _PeriodSimulator:
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
-        self._apply_component_inputs(np.zeros(24))
+        self._apply_input_changes(np.zeros(24))
         self._simulator.Initialize()
 
     def _get_block(self, name: str) -> Any:
@@ -247,7 +251,7 @@ class _PeriodSimulator:
         joints = self._get_context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
-        remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
+        remembered = np.full(len(self._sensor.motion_dependent_state_indices), _ANGLE_STEP)
         groups = [
             whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
             whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
@@ -258,7 +262,7 @@ class _PeriodSimulator:
             _StateGroup(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
+            _StateGroup("wrist_sensor", 0, self._sensor.motion_dependent_state_indices, remembered),
         ]
         if self._has_ik_state:
             steps = np.full(self._joints, self._command_step)
@@ -288,7 +292,7 @@ class _PeriodSimulator:
                 state.get_mutable_value()[group.indices] = values
         self._sensor.reset_queue(self._get_context("wrist_sensor"))
 
-    def _apply_component_inputs(self, u: Array) -> None:
+    def _apply_input_changes(self, u: Array) -> None:
         self._fix_input_port("master_device", "hand_wrench_E", self._hand + u[:6])
         self._fix_input_port(
             "inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12])
@@ -327,7 +331,7 @@ class _PeriodSimulator:
             ]
         )
 
-    def find_rest_state(self, displacement: Array) -> tuple[Array, Array, Array]:
+    def find_rest_state_and_derivatives(self, displacement: Array) -> tuple[Array, Array, Array]:
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -337,7 +341,9 @@ class _PeriodSimulator:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display_state(self._device.coordinates_for_display(q), self._device.parameters),
+            initial_display_state(
+                self._device.coordinates_for_force_display(q), self._device.parameters
+            ),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
@@ -347,30 +353,32 @@ class _PeriodSimulator:
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
-            self._apply_component_inputs(np.zeros(24))
+            self._apply_input_changes(np.zeros(24))
             self._run_one_period()
-        return self._find_equilibrium_state(self._balance_hand_force())
+        return self._find_equilibrium_state_and_derivatives(
+            self._balance_hand_force_and_get_state()
+        )
 
-    def _balance_hand_force(self) -> Array:
+    def _balance_hand_force_and_get_state(self) -> Array:
         self._wrench = self._evaluate_output("force_scaling", "wrench_B")
-        self._apply_component_inputs(np.zeros(24))
+        self._apply_input_changes(np.zeros(24))
         self._hand = -self._evaluate_output("force_display", "force_to_master")
-        self._apply_component_inputs(np.zeros(24))
+        self._apply_input_changes(np.zeros(24))
         return self.get_state()
 
-    def _find_equilibrium_state(self, x: Array) -> tuple[Array, Array, Array]:
+    def _find_equilibrium_state_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_EQUILIBRIUM_NEWTON_STEPS):
             A, C = self.differentiate_by_state(x)
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
             moved = self._run_one_period() - x
-            if (np.abs(moved) < _MAX_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
+            if (np.abs(moved) < _MAX_RELATIVE_MOTION_PER_PERIOD_AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
             self._set_state(x)
-            x = self._balance_hand_force()
+            x = self._balance_hand_force_and_get_state()
         raise DrakeTeleopError(
             f"the slave does not come to rest: {self.states[np.argmax(np.abs(moved))]} changes",
             where="displacement",
@@ -379,7 +387,7 @@ class _PeriodSimulator:
 
     def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
-        self._apply_component_inputs(np.zeros(24))
+        self._apply_input_changes(np.zeros(24))
         for k, step in enumerate(self._steps):
             ends, outputs = [], []
             for sign in (1.0, -1.0):
@@ -401,7 +409,7 @@ class _PeriodSimulator:
             ends = []
             for sign in (1.0, -1.0):
                 self._set_state(x)
-                self._apply_component_inputs(sign * step * np.eye(24)[k])
+                self._apply_input_changes(sign * step * np.eye(24)[k])
                 ends.append(self._run_one_period())
             B[:, k] = (ends[0] - ends[1]) / (2 * step)
         return B
@@ -434,7 +442,7 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
         channel=Channel(),
         passivity=PassivityConfig(),
         wrist_sensor=without_parts(scenario.wrist_sensor, *parts),
-        master=scenario.master.without_coulomb_friction(),
+        master=scenario.master.without_coulomb_friction_and_encoder_steps(),
         slave__friction=[],
         load_estimator__enabled=False,
         # The closed form, if the arm has one, has no state.

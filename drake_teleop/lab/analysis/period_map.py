@@ -25,7 +25,7 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 (MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
-_MAX_RATE_OVER_HAND = 1000
+_MAX_RATE_OVER_HAND_RATE = 1000
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Sampling:
     low_pass_hz: float | None = None  #: of the sensor's 4th-order Butterworth filter; None: ideal
 
 
-def delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
+def one_way_delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
     """Return the one-way delay in whole hand periods, at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
@@ -101,7 +101,7 @@ def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
 
 def closed_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
     """Return the model with its loop closed over the delay of both ways."""
-    periods = 2 * delay_in_hand_periods(axis, sampling)
+    periods = 2 * one_way_delay_in_hand_periods(axis, sampling)
     return cut_axis_model(axis, sampling).close_loop(
         ["displayed_force"], ["received_force"], periods
     )
@@ -116,7 +116,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     bare = replace(bare, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0)
     model = cut_axis_model(bare, sampling)
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
-    delay_factor = np.exp(-1j * w * model.dt * delay_in_hand_periods(axis, sampling))
+    delay_factor = np.exp(-1j * w * model.dt * one_way_delay_in_hand_periods(axis, sampling))
     # Responses without delay to a force on the device, and to one of the environment.
     response = model.frequency_response(w)[:, :, :2]
     (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
@@ -133,11 +133,13 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    if not (1 <= count <= _MAX_RATE_OVER_HAND and (np.abs(ratios - count) <= 1e-9 * count).all()):
+    if not (
+        1 <= count <= _MAX_RATE_OVER_HAND_RATE and (np.abs(ratios - count) <= 1e-9 * count).all()
+    ):
         raise DrakeTeleopError(
             "is no whole multiple of hand_hz",
             where=f"sampling.{name}",
-            remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND} times as fast as the hand",
+            remedy=f"let servo and sensor run 1 to {_MAX_RATE_OVER_HAND_RATE} times as often",
         )
     return count
 
@@ -173,7 +175,7 @@ class _PeriodMapRows:
     def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
-        x, v, push = mass_spring_motion(0.0, axis.device_damping / mass, period)
+        x, v, push = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
         hand_force = {
             MASTER_X: -axis.hand_stiffness / mass,
             MASTER_V: -axis.hand_damping / mass,
@@ -214,7 +216,9 @@ class _PeriodMapRows:
     def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
-        x, v, push = mass_spring_motion(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
+        x, v, push = mass_spring_responses_to_unit_x_v_u(
+            axis.wall_stiffness / mass, axis.wall_damping / mass, time
+        )
         rows = []
         for i in range(2):
             p = push[..., i]
@@ -231,7 +235,7 @@ class _PeriodMapRows:
         return np.stack(rows, axis=-2)
 
 
-def mass_spring_motion(
+def mass_spring_responses_to_unit_x_v_u(
     stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
 ) -> tuple[Array, Array, Array]:
     """Return (x, x') of x'' = u - b x' - k x after `time`: of x = 1, of x' = 1, and of u = 1."""

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from drake_teleop.common.html import write_report_page
+from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import (
     BLACK,
@@ -65,7 +65,7 @@ def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) ->
         "widths": draw_z_widths(curves, summary["z_width"]),
         "maps": draw_stability_maps(curves, summary["grip"]),
     }
-    write_report_page(
+    write_report_page_and_pictures(
         out,
         "drake_teleop.lab.analysis",
         pictures,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.analysis.one_axis import Complex
-from drake_teleop.lab.analysis.period_map import mass_spring_motion
+from drake_teleop.lab.analysis.period_map import mass_spring_responses_to_unit_x_v_u
 
 _NUM_STIFFNESS_BISECTIONS = 60
 
@@ -39,7 +39,7 @@ def stable_stiffness(
     Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
     device = mass, damping, hand_stiffness
-    push = _sampled_device_motion(*device, period)[2]
+    push = _sampled_device_responses_to_unit_x_v_f(*device, period)[2]
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
     high = 5 / push[..., 0] + np.abs(wall_damping) / period
     low = np.zeros_like(high)
@@ -61,7 +61,7 @@ def sampled_poles(
 ) -> Complex:
     """Return the closed loop's eigenvalues (..., 3) over a sample."""
     K, B = np.broadcast_arrays(wall_stiffness, wall_damping)
-    x, v, push = _sampled_device_motion(mass, damping, hand_stiffness, period)
+    x, v, push = _sampled_device_responses_to_unit_x_v_f(mass, damping, hand_stiffness, period)
     # States: position, velocity, last sampled position
     force = np.stack([K + B / period, np.zeros_like(B, dtype=float), -B / period], axis=-1)
     held = push[..., :, None] * force[..., None, :]
@@ -71,7 +71,7 @@ def sampled_poles(
     return np.linalg.eigvals(step).astype(complex)
 
 
-def _sampled_device_motion(
+def _sampled_device_responses_to_unit_x_v_f(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array, Array]:
     m = _check_positive(mass, "mass of the device")
@@ -84,7 +84,7 @@ def _sampled_device_motion(
             where="hand_stiffness",
             remedy="give 0 or more [N/m]",
         )
-    x, v, push = mass_spring_motion(k / m, b / m, period)
+    x, v, push = mass_spring_responses_to_unit_x_v_u(k / m, b / m, period)
     return x, v, push / m[..., None]
 
 

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.delayed_contact import (
     LEAF_THICKNESSES_M,
     delayed_contact,
     figures_of_station_run,
-    vertical_traces,
+    vertical_force_and_energy_traces,
 )
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
@@ -56,10 +56,10 @@ ROUND_TRIPS_S = (
     *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
 )
 WALL_STIFFNESSES_N_M = (500.0, 5100.0, 20000.0)  #: N/m
-NETWORK_IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
+JITTER_AND_LOSS_PAIRS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
-_INJECTED_ENERGY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_SIGMA_ROUND_TRIP_WALL_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _STATION_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
@@ -175,7 +175,7 @@ def simulate_press(
         result, found = _run_while_stable(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    shown = vertical_traces(result, setup)
+    shown = vertical_force_and_energy_traces(result, setup)
     held = (shown["t"] >= task.release_start - task.rest_window) & (shown["t"] < task.release_start)
     fast = high_pass_above_5_hz(result.t[held], result["force_to_master"][held, :3])
     additional = {
@@ -212,7 +212,7 @@ def _run_while_stable(
 def _run_one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
-    cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, NETWORK_IMPAIRMENTS))
+    cases = list(itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS))
     # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
@@ -291,7 +291,7 @@ def _run_station_study(
 
 def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
-    for done, (sigma, round_trip, wall) in enumerate(_INJECTED_ENERGY_CASES):
+    for done, (sigma, round_trip, wall) in enumerate(_SIGMA_ROUND_TRIP_WALL_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         rows.append(
@@ -303,7 +303,7 @@ def _run_injected_energy_study(stage: StartStage) -> list[dict[str, Any]]:
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )
-        progress((done + 1) / len(_INJECTED_ENERGY_CASES))
+        progress((done + 1) / len(_SIGMA_ROUND_TRIP_WALL_CASES))
     return rows
 
 

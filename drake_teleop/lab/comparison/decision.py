@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drake_teleop.lab.comparison.one_dof import TIP_DISTANCE_M
-from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_AT_REST_N
+from drake_teleop.lab.comparison.one_dof import WRIST_TO_TIP_DISTANCE_M
+from drake_teleop.station.oscillation import MAX_FORCE_RIPPLE_RMS_AT_REST_N
 
 VERDICT_UNSTABLE = "unstable"
 VERDICT_POSITION_ERROR = "position error"
@@ -31,10 +31,10 @@ class MethodResult:
         if self.verdict != VERDICT_LEAKS or self.leaked_J is None:
             return self.verdict
         number, unit = (1e3 * self.leaked_J, "mJ") if self.leaked_J < 1.0 else (self.leaked_J, "J")
-        return f"leaks {_format_two_digits(number)} {unit}"
+        return f"leaks {_format_two_significant_digits(number)} {unit}"
 
     @property
-    def displayed_share(self) -> str:
+    def least_displayed_share_text(self) -> str:
         """Least displayed over scaled contact force of all sheet springs [%]; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.force_pairs if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
@@ -66,7 +66,7 @@ def _summarise_runs_of_method(
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:
         return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)
-    if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_AT_REST_N:
+    if max(run["fast_force"] for run in runs) > MAX_FORCE_RIPPLE_RMS_AT_REST_N:
         return MethodResult(VERDICT_CHATTERS, forces, leaked_J=leaked)
     return MethodResult(
         VERDICT_LEAKS if leaked > MIN_LEAKED_ENERGY_J else VERDICT_HOLDS, forces, leaked_J=leaked
@@ -78,10 +78,10 @@ def _describe_motion_in_hold(run: Mapping[str, Any]) -> str:
         return "at rest"
     if run["hunting"] is None:
         return "ended early"
-    if TIP_DISTANCE_M * run["turning"] > run["hunting"]:
-        return f"turns by {_format_two_digits(1e3 * run['turning'])} mrad"
-    return f"moves by {_format_two_digits(1e3 * run['hunting'])} mm"
+    if WRIST_TO_TIP_DISTANCE_M * run["turning"] > run["hunting"]:
+        return f"turns by {_format_two_significant_digits(1e3 * run['turning'])} mrad"
+    return f"moves by {_format_two_significant_digits(1e3 * run['hunting'])} mm"
 
 
-def _format_two_digits(number: float) -> str:
+def _format_two_significant_digits(number: float) -> str:
     return f"{float(f'{number:.2g}'):g}"

@@ -9,7 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
-from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.comparison.station_accounts import (
+    start_energy,
+    station_accounts,
+    work_of_displayed_load_wrench,
+)
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
@@ -115,7 +119,9 @@ def figures_of_station_run(result: SimulationResult, scenario: Scenario, task: T
     )
 
 
-def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, Array]:
+def vertical_force_and_energy_traces(
+    result: SimulationResult, scenario: Scenario
+) -> dict[str, Array]:
     """Return a run's t [s], vertical forces at the master's scale [N] and energy [J]."""
     scaling = scenario.force_scaling
     return {
@@ -130,7 +136,7 @@ def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy (N,) that hand and environment put in so far, plus `start_energy` [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
-        accounts += load_work(result, scenario)
+        accounts += work_of_displayed_load_wrench(result, scenario)
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 

@@ -38,7 +38,7 @@ HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _RESISTANCE_FREQUENCIES_RAD_S = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST_M = 0.5e-3  # m, peak to peak at rest
-TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
+WRIST_TO_TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION_M, _PRESS_DEPTH_M = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
 
@@ -287,7 +287,8 @@ def figures_of_traces(
     start = round(task.press_start / dt)
     return RunMeasures(
         stable=bool(
-            hunting < _MAX_MOTION_AT_REST_M and turning < _MAX_MOTION_AT_REST_M / TIP_DISTANCE_M
+            hunting < _MAX_MOTION_AT_REST_M
+            and turning < _MAX_MOTION_AT_REST_M / WRIST_TO_TIP_DISTANCE_M
         ),
         hunting=hunting,
         turning=turning,
@@ -298,7 +299,7 @@ def figures_of_traces(
         free_force=float(
             np.sqrt(np.mean(felt[window_slice(task.swing_start, task.swing_end)] ** 2))
         ),
-        rise_delay=_rise_samples(felt[start:], pressed[start:], steady) * dt,
+        rise_delay=_rise_delay_in_samples(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
 
@@ -328,7 +329,7 @@ def _range_about_parabola(x: Array) -> float:
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _rise_samples(felt: Array, pressed: Array, steady: float) -> float:
+def _rise_delay_in_samples(felt: Array, pressed: Array, steady: float) -> float:
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))
@@ -402,7 +403,7 @@ def _simulate_steps(
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS_PER_CHANNEL_PERIOD * PERIOD * v_w)
             push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_pushing_force(push_then, push) * (x_s - x_then)
+            work = -_mean_of_positive_part(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -426,7 +427,7 @@ def _wall_force(stiffness, damping, depth, speed):
 
 
 @njit(cache=True)
-def _mean_pushing_force(a, b):
+def _mean_of_positive_part(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from drake_teleop.common.html import write_report_page
+from drake_teleop.common.html import write_report_page_and_pictures
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.comparison.decision import (
@@ -60,7 +60,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "energy": draw_energy(summary, traces),
         "limits": draw_round_trip_limits(summary["one_dof"]),
     }
-    write_report_page(
+    write_report_page_and_pictures(
         out,
         "drake_teleop.lab.comparison",
         pictures,
@@ -243,7 +243,8 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     for method in summary["methods"]:
         cells = [table[method, network] for network in summary["networks"]]
         grid.add_row(
-            method, *(f"{cell.verdict_text} {cell.displayed_share}".strip() for cell in cells)
+            method,
+            *(f"{cell.verdict_text} {cell.least_displayed_share_text}".strip() for cell in cells),
         )
     console.print(grid)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

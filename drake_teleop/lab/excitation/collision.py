@@ -38,10 +38,14 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
+from drake_teleop.lab.excitation.limits import (
+    allocate_link_motions,
+    capsule_distances,
+    write_link_motions,
+)
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.plant import finalize_plant
+from drake_teleop.station.slave.plant import finalize_without_limit_warnings
 
 # Vertices of the circumscribed polygon of a cylinder.
 _NUM_CYLINDER_RIM_POINTS = 24
@@ -121,7 +125,7 @@ _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.0
 # Smallest number of postures near contact for a correction.
 _MIN_POSTURES_NEAR_CONTACT = 5
 # Share of postures below which near capsules count although their shapes were never near.
-_RARE_CONTACT_SHARE = 0.05
+_MAX_SHARE_OF_RARE_CAPSULE_CONTACT = 0.05
 
 _TABLE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
@@ -139,20 +143,20 @@ class CollisionScene:
 
     Args:
         reserve: (10,) parameters phi of an additional load on the sensor.
-        visuals_count: whether visual shapes also collide.
+        visuals_collide: whether visual shapes also collide.
     """
 
     def __init__(
-        self, parse: ParseArm, reserve: Array, *, visuals_count: bool, where: str = ""
+        self, parse: ParseArm, reserve: Array, *, visuals_collide: bool, where: str = ""
     ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
-        _complete_collision_shapes(self.plant, self.scene_graph, visuals_count)
+        _complete_collision_shapes(self.plant, self.scene_graph, visuals_collide)
         _check_shape_sizes(self.plant, self.scene_graph, where)
         _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE_NAME)
-        finalize_plant(self.plant)
+        finalize_without_limit_warnings(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
         self._rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
@@ -161,7 +165,7 @@ class CollisionScene:
             for body in self.plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
                 self._rows[body] = row
 
-    def find_collision_candidates(
+    def find_collision_candidates_and_touching(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_ShapePair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
@@ -211,12 +215,12 @@ class CollisionScene:
                 del distances[a, b]
         return distances, sorted(set(touching))
 
-    def bounding_capsules(
+    def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
         """Return links, ends, radii, pairs and minimum distances of capsules around the shapes."""
         inspector = self.scene_graph.model_inspector()
-        motions = empty_motions(1, self.arm.num_joints)
+        motions = allocate_link_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
@@ -249,14 +253,14 @@ class CollisionScene:
         pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         outer_capsules = [capsules[shape][1] for shape in outer_shapes]
-        motions = empty_motions(len(postures), self.arm.num_joints)
+        motions = allocate_link_motions(len(postures), self.arm.num_joints)
         write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in outer_capsules]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in outer_capsules])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _min_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
+            distance = _required_capsule_distance(shape_distances[a, b], capsules_apart[:, k])
             near = shape_distances[a, b] < MIN_CLEARANCE_M
             capsules_near = capsules_apart[:, k] < distance
             if near.sum() >= _MIN_POSTURES_NEAR_CONTACT:
@@ -264,7 +268,9 @@ class CollisionScene:
             else:
                 useful = (
                     near.any()
-                    or 0 < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M) < _RARE_CONTACT_SHARE
+                    or 0
+                    < np.mean(capsules_apart[:, k] < MIN_CLEARANCE_M)
+                    < _MAX_SHARE_OF_RARE_CAPSULE_CONTACT
                 )
             if useful:
                 used.append(k)
@@ -272,7 +278,7 @@ class CollisionScene:
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _min_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _required_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     touching = (of_shapes > _NEAR_CONTACT_GAPS_M[0]) & (of_shapes < _NEAR_CONTACT_GAPS_M[1])
     excess = np.zeros(1)
@@ -325,7 +331,7 @@ def _add_load(
 
 
 def _complete_collision_shapes(
-    plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool
+    plant: MultibodyPlant, scene_graph: SceneGraph, visuals_collide: bool
 ) -> None:
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
@@ -335,7 +341,7 @@ def _complete_collision_shapes(
                 X_BG = inspector.GetPoseInFrame(solid)
                 scene_graph.RemoveRole(plant.get_source_id(), solid, Role.kProximity)
                 _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
-        if plant.GetCollisionGeometriesForBody(body) and not visuals_count:
+        if plant.GetCollisionGeometriesForBody(body) and not visuals_collide:
             continue
         for k, visual in enumerate(plant.GetVisualGeometriesForBody(body)):
             X_BG, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)

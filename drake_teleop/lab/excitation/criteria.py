@@ -47,7 +47,7 @@ class CriterionScales(NamedTuple):
     nominal_phi: Array
 
 
-def characteristic_length(phi: Array) -> float:
+def limited_gyration_radius(phi: Array) -> float:
     """Return the load's radius of gyration about So [m], at most 0.1."""
     trace = phi[4] + phi[7] + phi[9]
     return float(min(0.1, np.sqrt(trace / (2 * phi[0]))))

@@ -15,7 +15,7 @@ from drake_teleop.lab.excitation.check import CHECK_RATE_HZ, LimitUse, check_tra
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
-    empty_motions,
+    allocate_link_motions,
     write_limit_uses,
     write_link_motions,
     write_sensor_motion,
@@ -23,7 +23,7 @@ from drake_teleop.lab.excitation.limits import (
 from drake_teleop.lab.excitation.optimizer import (
     DesignProblem,
     DesignTask,
-    Iterate,
+    FeasibleIterate,
     minimise_criterion,
 )
 from drake_teleop.lab.excitation.prediction import predicted_deviations
@@ -104,7 +104,7 @@ def excite(
             problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.criterion_value for iterate in found), default=np.inf))
-        small = _shrinking_motions_at_start(robot, found, problem, seed)
+        small = _shrinking_motions_about_start_posture(robot, found, problem, seed)
         trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
     excitation = assemble_excitation(robot, criterion, found, trajectory, uses)
     if not np.isfinite(excitation.values[criterion]):
@@ -120,7 +120,7 @@ def excite(
 def assemble_excitation(
     robot: Robot,
     criterion: str,
-    found: list[Iterate],
+    found: list[FeasibleIterate],
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
@@ -131,7 +131,7 @@ def assemble_excitation(
         criterion,
         criterion_values(robot, trajectory),
         predicted_deviations(
-            *sensor_motion(robot, trajectory),
+            *trajectory_sensor_motion(robot, trajectory),
             1 / CHECK_RATE_HZ,
             robot.sensor_noise,
             robot.limits.heaviest_phi,
@@ -146,7 +146,7 @@ def assemble_excitation(
 
 def find_best_within_limits(
     robot: Robot,
-    found: list[Iterate],
+    found: list[FeasibleIterate],
     progress: Callable[[float], None] = lambda done: None,
     others: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
@@ -172,17 +172,19 @@ def find_best_within_limits(
 
 def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
     """Return the value of every criterion at 1 kHz."""
-    motion = sensor_motion(robot, trajectory)
+    motion = trajectory_sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.criterion_scales).value(*motion, trajectory.period)
         for name in CRITERIA
     }
 
 
-def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
+def trajectory_sensor_motion(
+    robot: Robot, trajectory: FourierTrajectory
+) -> tuple[Array, Array, Array]:
     """Return specific force, omega, alpha (T, 3) of the sensor, in S, at 1 kHz over one period."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
     write_sensor_motion(motions, out)
@@ -190,7 +192,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     return s, omega, alpha
 
 
-def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
+def _feasible_candidates(found: list[FeasibleIterate], robot: Robot) -> Iterator[FourierTrajectory]:
     ranked = sorted(found, key=lambda iterate: iterate.criterion_value)
     last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
     checks = 0
@@ -208,8 +210,8 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
             return
 
 
-def _shrinking_motions_at_start(
-    robot: Robot, found: list[Iterate], problem: DesignProblem, seed: int
+def _shrinking_motions_about_start_posture(
+    robot: Robot, found: list[FeasibleIterate], problem: DesignProblem, seed: int
 ) -> Iterator[FourierTrajectory]:
     best = sorted(found, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
@@ -227,7 +229,7 @@ def _shrinking_motions_at_start(
 
 def _largest_limit_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / CHECK_RATE_HZ))
-    motions = empty_motions(*joints[0].shape)
+    motions = allocate_link_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMIT_NAMES)))
     gradients = np.empty((len(LIMIT_NAMES), 3, *joints[0].shape))

@@ -90,7 +90,7 @@ def write_sensor_motion(motions, out):
 
 
 @njit(cache=True)
-def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
+def add_criterion_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
     """Add a scalar's gradient by q, qd, qdd to `gradient` (3, T, n), from that by V (T, 6, 10)."""
     rows = motions.shape[1]
     seeds, g = np.zeros((rows, SEED_SIZE)), np.empty((3, 3))
@@ -277,8 +277,12 @@ def _write_clearance_use(
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
             distance = _DISTANCE_OF_FAR_CAPSULES_M
-            if not _are_segments_apart(ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M):
-                distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
+            if not _are_segments_surely_apart(
+                ends[t, a], ends[t, b], reach + ZERO_USE_CLEARANCE_MARGIN_M
+            ):
+                distance = (
+                    _segment_distance_and_nearest_into(ends[t, a], ends[t, b], nearest) - reach
+                )
             use[t, k] = (
                 1.0 - (distance - limits.min_pair_distances[k]) / ZERO_USE_CLEARANCE_MARGIN_M
             )
@@ -291,7 +295,7 @@ def _write_clearance_use(
             if use[t, k] < _MIN_SMOOTH_MAXIMUM_WEIGHT:
                 continue
             a, b = limits.capsule_pairs[k]
-            _segment_distance(ends[t, a], ends[t, b], nearest)
+            _segment_distance_and_nearest_into(ends[t, a], ends[t, b], nearest)
             for side in range(2):
                 capsule = limits.capsule_pairs[k, side]
                 row = limits.capsule_links[capsule]
@@ -316,7 +320,11 @@ def capsule_distances(motions, rows, ends, radii, pairs):
         _transform_capsules(motions[t], rows, ends, placed)
         for k in range(len(pairs)):
             a, b = pairs[k]
-            distances[t, k] = _segment_distance(placed[a], placed[b], nearest) - radii[a] - radii[b]
+            distances[t, k] = (
+                _segment_distance_and_nearest_into(placed[a], placed[b], nearest)
+                - radii[a]
+                - radii[b]
+            )
     return distances
 
 
@@ -334,7 +342,7 @@ def _transform_capsules(motions, rows, ends, placed):
 
 
 @njit(cache=True)
-def _are_segments_apart(first, second, distance):
+def _are_segments_surely_apart(first, second, distance):
     # Sufficient condition for two segments (2, 3).
     between = length_a = length_b = 0.0
     for i in range(3):
@@ -346,7 +354,7 @@ def _are_segments_apart(first, second, distance):
 
 
 @njit(cache=True)
-def _segment_distance(first, second, nearest):
+def _segment_distance_and_nearest_into(first, second, nearest):
     """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
     Write to `nearest` (5,): positions on both segments (0 to 1), unit vector to the first.
@@ -381,5 +389,5 @@ def _segment_distance(first, second, nearest):
     return distance
 
 
-def empty_motions(samples: int, joints: int) -> Array:
+def allocate_link_motions(samples: int, joints: int) -> Array:
     return np.empty((samples, joints + 1, SENSOR_MOTION_SIZE))

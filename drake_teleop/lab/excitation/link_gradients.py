@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
-    add_into,
+    add_vector_into,
     apply_matrix,
     cross,
     dot,
@@ -44,15 +44,15 @@ def rotate_to_link(motion, a):
 def add_vector_to_seed(motion, place, gradient, seed):
     """Add to a link's `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in its frame."""
     g = rotate_to_world(motion, gradient)
-    add_into(seed, place, g)
-    add_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, place)))
+    add_vector_into(seed, place, g)
+    add_vector_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, place)))
 
 
 @njit(cache=True)
 def add_point_to_seed(motion, point, gradient, seed):
     """Add to a link's `seed` a derivative, in W, by the position of a point (3,) fixed to it."""
-    add_into(seed, _P_IN_SEED, gradient)
-    add_into(seed, _THETA_IN_SEED, cross(rotate_to_world(motion, point), gradient))
+    add_vector_into(seed, _P_IN_SEED, gradient)
+    add_vector_into(seed, _THETA_IN_SEED, cross(rotate_to_world(motion, point), gradient))
 
 
 @njit(cache=True)
@@ -104,9 +104,9 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
         torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
         torque = plus(torque, cross(h, s))
         F, N = rotate_to_world(motion, force), rotate_to_world(motion, torque)
-        add_into(seeds[row], _VIRTUAL_V_IN_SEED, F)
-        add_into(seeds[row], _VIRTUAL_W_IN_SEED, N)
-        add_into(seeds[row], _THETA_IN_SEED, plus(cross(F, v), cross(N, w)))
+        add_vector_into(seeds[row], _VIRTUAL_V_IN_SEED, F)
+        add_vector_into(seeds[row], _VIRTUAL_W_IN_SEED, N)
+        add_vector_into(seeds[row], _THETA_IN_SEED, plus(cross(F, v), cross(N, w)))
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLUE
 from drake_teleop.lab.excitation.check import CHECK_RATE_HZ
-from drake_teleop.lab.excitation.excite import Excitation, sensor_motion
+from drake_teleop.lab.excitation.excite import Excitation, trajectory_sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.replay_file import (
@@ -31,7 +31,7 @@ _TABLE_COLOUR, _LINK_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
 _LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
 # Camera position from the middle of the motion, in sizes of the arm.
-_CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
+_CAMERA_OFFSET_IN_ARM_SIZES = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_replay(path: Path, found: Excitation) -> None:
@@ -44,7 +44,9 @@ def write_motion_replay(path: Path, found: Excitation) -> None:
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
     force = np.linalg.norm(
-        non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.heaviest_phi)[:, :3],
+        non_contact_wrench(*trajectory_sensor_motion(robot, trajectory), robot.limits.heaviest_phi)[
+            :, :3
+        ],
         axis=1,
     )
     samples = np.minimum(np.rint(times * CHECK_RATE_HZ).astype(int), len(force) - 1)
@@ -124,4 +126,4 @@ def _add_table_and_sensor_path(meshcat: Meshcat, path_S: Array, bodies: Array) -
     meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _TABLE_THICKNESS_M), _TABLE_COLOUR)
     meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_TABLE_THICKNESS_M / 2]))
     meshcat.SetLine("/way", path_S.T, 3.0, colour_to_rgba(BLUE))
-    meshcat.SetCameraPose(middle + size * _CAMERA_POSITION, middle)
+    meshcat.SetCameraPose(middle + size * _CAMERA_OFFSET_IN_ARM_SIZES, middle)

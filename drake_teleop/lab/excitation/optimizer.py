@@ -17,8 +17,8 @@ from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMIT_NAMES,
     Limits,
-    criterion_gradient,
-    empty_motions,
+    add_criterion_gradient_by_joints,
+    allocate_link_motions,
     finite_half_ranges,
     write_limit_uses,
     write_link_motions,
@@ -84,7 +84,7 @@ class DesignProblem:
         )
         #: (3, T, free): q, qd, qdd of unit coefficients.
         self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period_s / samples))
-        self._motions = empty_motions(samples, n)
+        self._motions = allocate_link_motions(samples, n)
         self._vectors = np.empty((3, samples, 3))
         self._gradients = np.empty((1 + len(LIMIT_NAMES), 3, samples, n))
 
@@ -119,7 +119,9 @@ class DesignProblem:
         g[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
-        criterion_gradient(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0])
+        add_criterion_gradient_by_joints(
+            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[0]
+        )
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[1:])
         return Evaluation(value, smooth, self._gradients_by_unknowns(), largest)
 
@@ -182,7 +184,7 @@ _MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
 
 
 @dataclass(frozen=True)
-class Iterate:
+class FeasibleIterate:
     """Feasible trajectory, found after `cpu_time_s` of thread CPU time."""
 
     cpu_time_s: float
@@ -199,7 +201,7 @@ def minimise_criterion(
     starts: int = 4,
     seconds: float | None = None,
     progress: Callable[[float, float], None] = lambda done, best: None,
-) -> list[Iterate]:
+) -> list[FeasibleIterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
     `seconds` of thread CPU time replace `starts`, but make results irreproducible.
@@ -232,7 +234,7 @@ class _DescentSearch:
         self._problem, self._starts = problem, starts
         self._seconds, self._progress = seconds, progress
         self.start = 0
-        self.found: list[Iterate] = []
+        self.found: list[FeasibleIterate] = []
         self._best = self._best_of_start = float("inf")
         self._evaluations = self._all_evaluations = 0
         self._key = b""
@@ -331,7 +333,7 @@ class _DescentSearch:
             seconds = time.thread_time() - self._start_time
             trajectory = self._problem.trajectory(x)
             self.found.append(
-                Iterate(seconds, self._all_evaluations, self.start, value, trajectory)
+                FeasibleIterate(seconds, self._all_evaluations, self.start, value, trajectory)
             )
 
     def _count_evaluation(self) -> None:

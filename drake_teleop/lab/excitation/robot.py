@@ -12,7 +12,7 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.collision import MIN_CLEARANCE_M, CollisionScene
-from drake_teleop.lab.excitation.criteria import CriterionScales, characteristic_length
+from drake_teleop.lab.excitation.criteria import CriterionScales, limited_gyration_radius
 from drake_teleop.lab.excitation.limits import Limits, finite_half_ranges
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -26,7 +26,11 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, read_arm_kinematics
+from drake_teleop.station.slave.plant import (
+    NominalSlave,
+    ParseSlave,
+    read_arm_without_default_limits,
+)
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES_FOR_SHAPE_DISTANCES = 1000  # random postures for distances of shapes
@@ -80,7 +84,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
     scene = CollisionScene(
-        parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_count=not own
+        parse, (_HEAVIEST_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load, visuals_collide=not own
     )
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_W)
@@ -120,7 +124,7 @@ def RobotFromModel(
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
-    arm = read_arm_kinematics(path, sensor_frame, package_paths)
+    arm = read_arm_without_default_limits(path, sensor_frame, package_paths)
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
@@ -145,7 +149,7 @@ def RobotFromModel(
         inertia = missing_mass * _ASSUMED_PAYLOAD_GYRATION_RADIUS_M**2 * np.eye(3) * 2 / 3
         reserve = phi_from_mass_com_inertia(missing_mass, com, inertia)
     with translate_drake_errors(path):
-        scene = CollisionScene(parse, reserve, visuals_count=False, where=str(path))
+        scene = CollisionScene(parse, reserve, visuals_collide=False, where=str(path))
     assumptions += missing
     scene.arm, completed = fill_missing_joint_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
@@ -179,12 +183,12 @@ def _make_robot(
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES_FOR_SHAPE_DISTANCES, len(half)))
     postures = middle + finite_half_ranges(half) * random
-    candidates, touching = scene.find_collision_candidates(postures, start)
+    candidates, touching = scene.find_collision_candidates_and_touching(postures, start)
     if touching:
         assumptions.append(
             f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
         )
-    rows, ends, radii, pairs, distances = scene.bounding_capsules(candidates, postures)
+    rows, ends, radii, pairs, distances = scene.bounding_capsules_and_pairs(candidates, postures)
     phi, std = arm.phi_load, sensor.wrench_std()
     force = _USABLE_SENSOR_FORCE_SHARE * min(sensor.force_range)
     torque = _USABLE_SENSOR_TORQUE_SHARE * min(sensor.torque_range)
@@ -213,7 +217,7 @@ def _make_robot(
         arm=arm,
         limits=limits,
         criterion_scales=CriterionScales(
-            (float(std[0]), float(std[3])), characteristic_length(phi), phi
+            (float(std[0]), float(std[3])), limited_gyration_radius(phi), phi
         ),
         sensor_noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
         home_posture=middle if start is None else start,

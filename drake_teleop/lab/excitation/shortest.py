@@ -24,9 +24,9 @@ from drake_teleop.lab.excitation.excite import (
     Excitation,
     assemble_excitation,
     find_best_within_limits,
-    sensor_motion,
+    trajectory_sensor_motion,
 )
-from drake_teleop.lab.excitation.limits import LIMIT_NAMES, criterion_gradient
+from drake_teleop.lab.excitation.limits import LIMIT_NAMES, add_criterion_gradient_by_joints
 from drake_teleop.lab.excitation.optimizer import (
     Bounds,
     DesignProblem,
@@ -48,7 +48,7 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 
-RELIABLE_PROBABILITY = 0.95
+PROBABILITY_ALL_WITHIN_TOLERANCE = 0.95
 """Share of the records in which all numbers are within their tolerances together."""
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
@@ -122,7 +122,7 @@ def design_shortest_motion(
             around = None
             continue
         trajectory, uses = find_best_within_limits(robot, found)
-        motion = sensor_motion(robot, trajectory)
+        motion = trajectory_sensor_motion(robot, trajectory)
         covariance = predicted_covariance(
             *motion, 1 / CHECK_RATE_HZ, robot.sensor_noise, robot.limits.heaviest_phi
         )
@@ -156,7 +156,7 @@ def design_shortest_motion(
 
 def sidak_factor(count: int) -> float:
     """Return z; `count` numbers are within z deviations together with 95 % probability (Sidak)."""
-    return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
+    return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
 
 
 class ShortestMotionProblem(DesignProblem):
@@ -176,7 +176,9 @@ class ShortestMotionProblem(DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = relative_white_noise_densities(robot.sensor_noise, robot.limits.heaviest_phi)
+        self._noise = white_noise_densities_over_wrench_noise(
+            robot.sensor_noise, robot.limits.heaviest_phi
+        )
         self._roots = np.sqrt(robot.sensor_noise.white_noise_densities[:6])
         samples, n = self._vectors.shape[1], len(task.home_posture)
         self._gradients = np.empty((2 + len(LIMIT_NAMES), 3, samples, n))
@@ -219,7 +221,9 @@ class ShortestMotionProblem(DesignProblem):
         use, worst, g_V = self._largest_error_over_tolerance(
             _TOLERANCE_SHARPNESS_RATIO * criterion_sharpness
         )
-        criterion_gradient(self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1])
+        add_criterion_gradient_by_joints(
+            self.task.arm_table, self._motions, *q_qd_qdd[1:], g_V, g[1]
+        )
         smooth, largest = self._limit_uses(q_qd_qdd, limit_sharpness, g[2:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -238,14 +242,16 @@ class ShortestMotionProblem(DesignProblem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the predicted deviations (k,) with white noise, over the required ones."""
-        return np.sqrt(self._estimate_variances(self._weighted_regressor_rows(*motion), period)[0])
+        return np.sqrt(
+            self._variances_of_estimates(self._weighted_regressor_rows(*motion), period)[0]
+        )
 
     def _weighted_regressor_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
-    def _estimate_variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
+    def _variances_of_estimates(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         # Variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k, u_k = G^-1 B v_k: G is the information of
         # weighted least squares; B contains the noise densities; e_k is a row of `errors`
         # (sandwich, White, Econometrica 1980).
@@ -261,7 +267,7 @@ class ShortestMotionProblem(DesignProblem):
 
     def _largest_error_over_tolerance(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
-        variances, v, u = self._estimate_variances(rows, self._period)
+        variances, v, u = self._variances_of_estimates(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
         smooth = float(logs.max() + np.log(weights.sum()) / sharpness)
@@ -272,7 +278,7 @@ class ShortestMotionProblem(DesignProblem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def relative_white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
+def white_noise_densities_over_wrench_noise(noise: SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) with load phi, relative to the wrench's."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:

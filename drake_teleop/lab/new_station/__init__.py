@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import make_folder, whole_file, write_picture
+from drake_teleop.common.files import make_folder, replace_file_on_success, write_picture
 from drake_teleop.lab.new_station.picture import draw_start
 from drake_teleop.lab.new_station.plan import StationPlan, plan_station
-from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
+from drake_teleop.lab.new_station.text import round_to_four_significant_digits, scenario_text
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
@@ -70,7 +70,7 @@ def new_command(
     tool_path = None if tool is None else _relative_path(folder, tool)
     try:
         text = scenario_text(plan, slave_data, tool_path, device, sensor)
-        with whole_file(scenario) as unfinished:
+        with replace_file_on_success(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
             read = [slave.path, *slave.package_folders]
@@ -107,7 +107,10 @@ def _print_plan(plan: StationPlan, scenario: Path, picture: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joint_names)}: {', '.join(plan.joint_names)}"),
         ("Tool", f"{plan.tool_mass_kg:.4g} kg, {tool}"),
-        ("Start", f"sensor at {round_to_four_digits(plan.place.position)} m, tool down"),
+        (
+            "Start",
+            f"sensor at {round_to_four_significant_digits(plan.place.position)} m, tool down",
+        ),
         ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):

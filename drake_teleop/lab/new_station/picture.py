@@ -64,7 +64,7 @@ def draw_start(plan: StationPlan, title: str) -> Figure:
             )
             axes.add_collection3d(collection)
             axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
-            _draw_plane(axes, lower, upper, plan.base_plane_height)
+            _draw_base_plane_grid(axes, lower, upper, plan.base_plane_height)
             _draw_triad(axes, shapes, _SENSOR_AXES_LENGTH_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
             _fit_view(axes, lower, upper, plan.base_plane_height)
@@ -132,7 +132,7 @@ def _shade_triangles(triangles: Array, colour: tuple[float, float, float]) -> Ar
     return np.clip(np.outer(bright, colour), 0.0, 1.0)
 
 
-def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
+def _draw_base_plane_grid(axes: Any, lower: Array, upper: Array, height: float) -> None:
     margin = 0.1 * float(max(upper - lower))
     x = np.linspace(lower[0] - margin, upper[0] + margin, 7)
     y = np.linspace(lower[1] - margin, upper[1] + margin, 7)

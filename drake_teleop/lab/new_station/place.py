@@ -24,13 +24,13 @@ from drake_teleop.lab.new_station.random_postures import (
     NUM_RANDOM_POSTURES,
     Postures,
     StartRegion,
-    degrees_of_freedom,
-    joint_margins,
+    least_joint_margins,
     posture_scores,
     postures_at,
     random_postures,
     rotate_sensor_frame_of_arm,
     select_suitable_postures,
+    sensor_degrees_of_freedom,
 )
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
 from drake_teleop.station.slave.arm import (
@@ -162,10 +162,12 @@ def find_start_place(
     pointed = rotate_sensor_frame_of_arm(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
     postures, region = select_suitable_postures(random_postures(pointed), plane, length)
-    is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
+    can_move_in_six_dof = len(postures.q) > 0 and sensor_degrees_of_freedom(pointed, postures) == 6
     found = list[StartPlace]()
     for rows in _order_postures_to_solve(pointed, postures, region, shapes):
-        solved = _solve_candidates(pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, is_free)
+        solved = _solve_candidates(
+            pointed, postures[rows[:_NUM_SOLVED_POSTURES]], region, can_move_in_six_dof
+        )
         found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.has_overlaps for place in found):
             break
@@ -177,7 +179,7 @@ def find_start_place(
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
         if best is None or best.cube_half_m == 0.0:
             cubes = [
-                _with_reachable_cube(pointed, place, is_free, vertical)
+                _with_reachable_cube(pointed, place, can_move_in_six_dof, vertical)
                 for place in places[:_MAX_TESTED_CUBES]
             ]
             best = max(cubes, key=_merit_of_start_place, default=None)
@@ -192,9 +194,9 @@ def find_start_place(
     return best._replace(pose=pose, is_set_by_position=best.is_set_by_position and axis == "z")
 
 
-def _find_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+def _find_roomy_holdable_postures(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     # Far from joint limits and, with decreasing load, held by the motors; otherwise all rows.
-    roomy = joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
+    roomy = least_joint_margins(arm, q) > _MIN_START_JOINT_MARGIN
     for share in (1.0, MIN_LOAD_SHARE_HELD_BY_MOTORS):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
@@ -215,7 +217,7 @@ def _order_postures_to_solve(
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
-    usable = order[np.isin(order, _find_holdable_postures(arm, postures.q))]
+    usable = order[np.isin(order, _find_roomy_holdable_postures(arm, postures.q))]
     yield usable
     if shapes is None:
         return
@@ -229,9 +231,9 @@ def _order_postures_to_solve(
 
 
 def _solve_candidates(
-    arm: ArmModel, postures: Postures, region: StartRegion, is_free: bool
+    arm: ArmModel, postures: Postures, region: StartRegion, can_move_in_six_dof: bool
 ) -> Iterator[StartPlace]:
-    if not is_free:  # position and orientation are coupled
+    if not can_move_in_six_dof:  # position and orientation are coupled
         solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
         solved = [
@@ -241,9 +243,11 @@ def _solve_candidates(
         ]
     if not solved:
         return
-    solved = [solved[k] for k in _find_holdable_postures(arm, np.array([q for q, _, _ in solved]))]
+    solved = [
+        solved[k] for k in _find_roomy_holdable_postures(arm, np.array([q for q, _, _ in solved]))
+    ]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
-    merits, rooms = posture_scores(arm, exact, region), joint_margins(arm, exact.q)
+    merits, rooms = posture_scores(arm, exact, region), least_joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
         yield StartPlace(pose, by_position, q, 0.0, float(room), float(merit))
 
@@ -279,7 +283,7 @@ def _with_largest_wall(
     if shapes is None:
         return place
     shapes.move_to(place.q)
-    walls = _move_walls_below_tool(shapes)
+    walls = _move_walls_below_tool_and_get_edges(shapes)
     depths = dict.fromkeys(walls, 0.0)
     cost = max(
         region.plane_height
@@ -306,7 +310,7 @@ def _with_largest_wall(
     )
 
 
-def _move_walls_below_tool(shapes: PostureShapes) -> dict[BodyIndex, float]:
+def _move_walls_below_tool_and_get_edges(shapes: PostureShapes) -> dict[BodyIndex, float]:
     plant, walls = shapes.plant, {}
     x, y, z = lowest_tool_point(shapes)
     middle = RigidTransform(
@@ -342,26 +346,30 @@ def _merit_of_start_place(place: StartPlace) -> tuple[float, float, bool, float]
 
 
 def _with_reachable_cube(
-    arm: ArmModel, place: StartPlace, is_free: bool, vertical: bool
+    arm: ArmModel, place: StartPlace, can_move_in_six_dof: bool, vertical: bool
 ) -> StartPlace:
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    if vertical or not is_free:
+    if vertical or not can_move_in_six_dof:
         signs = np.vstack([np.eye(3), -np.eye(3)])
     if vertical:
         signs = signs[[2, 5]]
     largest = 0.0
     for half in _CUBE_HALF_EDGES_M:
-        if not all(_can_reach_corner(arm, place, half * each, is_free) for each in signs):
+        if not all(
+            _can_reach_corner(arm, place, half * each, can_move_in_six_dof) for each in signs
+        ):
             break
         largest = half
     room = place.joint_margin if largest else 0.0
     return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
-def _can_reach_corner(arm: ArmModel, place: StartPlace, displacement: Array, is_free: bool) -> bool:
+def _can_reach_corner(
+    arm: ArmModel, place: StartPlace, displacement: Array, can_move_in_six_dof: bool
+) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
-    if is_free:
+    if can_move_in_six_dof:
         return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_MOVE_TO_CORNER)
     error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
@@ -374,7 +382,7 @@ _ROUNDING_TOLERANCE_M = 1e-9
 _MIN_DIRECTED_COM_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 
 
-def nearest_axis(direction: Array) -> str:
+def nearest_sensor_axis(direction: Array) -> str:
     """Return the axis of S nearest to a direction (3,) in S; empty if none is near."""
     size = np.linalg.norm(direction)
     k = int(np.argmax(np.abs(direction)))
@@ -383,11 +391,13 @@ def nearest_axis(direction: Array) -> str:
     return ("-" if direction[k] < 0.0 else "") + "xyz"[k]
 
 
-def last_joint_axis(arm: ArmModel) -> str:
+def sensor_axis_along_last_joint(arm: ArmModel) -> str:
     """Return the axis of S that points away from the last joint along it; empty: none."""
     row = arm.table[arm.num_joints]
     along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
-    return nearest_axis(-along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M else along)
+    return nearest_sensor_axis(
+        -along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_TOLERANCE_M else along
+    )
 
 
 def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:

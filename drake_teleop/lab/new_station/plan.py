@@ -18,9 +18,9 @@ from drake_teleop.lab.new_station.place import (
     TrialWalls,
     extent_beyond_sensor,
     find_start_place,
-    last_joint_axis,
     lowest_tool_point,
-    nearest_axis,
+    nearest_sensor_axis,
+    sensor_axis_along_last_joint,
     tool_frame_advice,
 )
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
@@ -103,11 +103,11 @@ def plan_station(
     )
     shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_TOOL_LOAD if tool is None else 0.0)
-    axis, own_tool = _tool_axis(shapes, load), False
+    axis, own_tool = _sensor_axis_along_tool(shapes, load), False
     if tool is None and _tool_extends_beyond_link(shapes, axis) and load[0] > _MIN_TOOL_MASS_KG:
         slave.tool, own_tool = None, True
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
-    plane = base_plane(shapes)
+    plane = find_base_plane_height(shapes)
     place, axis, shapes = _find_start_and_tool_axis(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
     share = 1.0 if own_tool else MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
@@ -118,7 +118,7 @@ def plan_station(
     figures = FIGURES.get(device)
     room = _PHANTOM_WORKSPACE_HALF_EDGE_M if figures is None else min(figures.size) / 2.0
     peak = PEAK_FORCE_N if figures is None else figures.peak_force
-    translation_scale = _floor_two_digits(min(place.cube_half_m / room, 1.0))
+    translation_scale = _floor_to_two_significant_digits(min(place.cube_half_m / room, 1.0))
     force_scale = min(
         peak / (1.5 * 9.81 * mass + _DISPLAYABLE_CONTACT_FORCE_N),
         _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS_N_M * translation_scale),
@@ -135,8 +135,8 @@ def plan_station(
         has_own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
-        force_scale=_floor_two_digits(force_scale),
-        swing_amplitude_m=_floor_two_digits(
+        force_scale=_floor_to_two_significant_digits(force_scale),
+        swing_amplitude_m=_floor_to_two_significant_digits(
             swing * min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_use(model, place, swing))
         ),
         lowest_tool_point_W=lowest,
@@ -180,11 +180,11 @@ def _find_start_and_tool_axis(
     return best
 
 
-def _tool_axis(shapes: PostureShapes, load: Array) -> str:
+def _sensor_axis_along_tool(shapes: PostureShapes, load: Array) -> str:
     """Return the axis of S towards the model's own load, or else along the last joint; else z."""
-    if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
+    if load[0] > _MIN_TOOL_MASS_KG and (axis := nearest_sensor_axis(load[1:] / load[0])):
         return axis
-    return last_joint_axis(shapes.arm) or "z"
+    return sensor_axis_along_last_joint(shapes.arm) or "z"
 
 
 def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
@@ -195,7 +195,7 @@ def _tool_extends_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
-def base_plane(shapes: PostureShapes) -> float:
+def find_base_plane_height(shapes: PostureShapes) -> float:
     """Return the height of the base plane [m]: the lowest point of the shapes fixed to the world.
 
     Without such shapes: the base, but not above the first joint.
@@ -251,6 +251,6 @@ def _swing_speed_use(arm: ArmModel, place: StartPlace, swing: float) -> float:
     return float((2.0 * np.pi * SWING_HZ * displacement / arm.velocity_limit).max())
 
 
-def _floor_two_digits(value: float) -> float:
+def _floor_to_two_significant_digits(value: float) -> float:
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")

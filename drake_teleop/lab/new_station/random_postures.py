@@ -180,13 +180,15 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
 
     It combines limits, singularities, elbow, base plane and preferred place.
     """
-    margin = np.minimum(joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
+    margin = np.minimum(least_joint_margins(arm, postures.q) / _SUFFICIENT_JOINT_MARGIN, 1.0)
     L = orientation_length(arm)
     # Only as many singular values as the arm has degrees of freedom.
-    smallest = _jacobian_singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    smallest = _jacobian_singular_values(arm, postures)[
+        :, sensor_degrees_of_freedom(arm, postures) - 1
+    ]
     sigma = np.minimum(smallest / (_SUFFICIENT_SINGULAR_VALUE * L), 1.0)
     elbow = (
-        np.minimum(elbow_up_share(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
+        np.minimum(upward_share_of_elbow_offset(postures, region.reach), _SUFFICIENT_ELBOW_UP_SHARE)
         / _SUFFICIENT_ELBOW_UP_SHARE
     )
     origins = postures.origins[:, region.is_joint_above_plane, 2]
@@ -196,7 +198,7 @@ def posture_scores(arm: ArmModel, postures: Postures, region: StartRegion) -> Ar
     return total
 
 
-def joint_margins(arm: ArmModel, q: Array) -> Array:
+def least_joint_margins(arm: ArmModel, q: Array) -> Array:
     """Return the least distance (k,) of joints to limits over half the range; 1 without limits."""
     limited = np.isfinite(arm.lower) & np.isfinite(arm.upper)
     lower, upper, inner = arm.lower[limited], arm.upper[limited], q[:, limited]
@@ -215,14 +217,14 @@ def _jacobian_singular_values(arm: ArmModel, postures: Postures) -> Array:
     return values
 
 
-def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
+def sensor_degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
     """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _jacobian_singular_values(arm, few)
     return int((values > _MAX_RATIO_OF_ZERO_SINGULAR_VALUE * values[:, :1]).sum(axis=1).max())
 
 
-def elbow_up_share(postures: Postures, reach: float) -> Array:
+def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
 
     The elbow is the joint that is farthest from the line of the first and last joint.

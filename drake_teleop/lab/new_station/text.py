@@ -26,7 +26,7 @@ def scenario_text(
     s, swing = plan.translation_scale, plan.swing_amplitude_m
     down = 1.5 * swing + min(_MAX_PRESS_DEPTH_INTO_WALL_M, swing / 4.0)
     if plan.place.is_set_by_position:
-        slave["position"] = round_to_four_digits(plan.place.position)
+        slave["position"] = round_to_four_significant_digits(plan.place.position)
     else:
         slave["home"] = plan.place.home
     comments = {
@@ -50,14 +50,14 @@ def scenario_text(
     if plan.weak_joints:
         slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
     if plan.tip_S:
-        slave["tip"] = round_to_four_digits(plan.tip_S)
+        slave["tip"] = round_to_four_significant_digits(plan.tip_S)
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
     swing_motion |= {
         "frequency": SWING_HZ,
-        "translation": round_to_four_digits([0.0, 0.0, swing / s]),
+        "translation": round_to_four_significant_digits([0.0, 0.0, swing / s]),
     }
     press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
-    press_motion |= {"translation": round_to_four_digits([0.0, 0.0, -down / s])}
+    press_motion |= {"translation": round_to_four_significant_digits([0.0, 0.0, -down / s])}
     wall = wall_of_plan(plan)
     size = {} if wall.size == Wall().size else {"size": wall.size}
     data = {
@@ -82,17 +82,17 @@ def wall_of_plan(plan: StationPlan) -> Wall:
     """Return the wall below the tool."""
     x, y, z = plan.lowest_tool_point_W
     return Wall(
-        position=round_to_four_digits([x, y, z - 1.5 * plan.swing_amplitude_m]),
+        position=round_to_four_significant_digits([x, y, z - 1.5 * plan.swing_amplitude_m]),
         size=[plan.place.wall_edge_m, plan.place.wall_edge_m],
         stiffness=WALL_STIFFNESS_N_M,
     )
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    own = Master(model=device).sampling_period(Rates().hand_hz)
+    own = Master(model=device).sampling_period_if_slower_than_hand(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
-def round_to_four_digits(values: Any) -> list[float]:
+def round_to_four_significant_digits(values: Any) -> list[float]:
     """Return numbers with four significant digits, for a file."""
     return [float(f"{value:.4g}") for value in values]

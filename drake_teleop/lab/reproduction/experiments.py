@@ -35,7 +35,7 @@ _ALL_AXES_MOTION = Sine(
 
 
 @dataclass(frozen=True, eq=False)
-class FreeMotion:
+class FreeMotionRun:
     """Recorded free movement.
 
     `scaled_wrenches`: sigma (share of the load's wrench) -> scaled wrench (N, 6) at the slave.
@@ -47,7 +47,7 @@ class FreeMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class IdealMotion:
+class IdealSensorRun:
     """Free movement with exact wrench and motion instead of sensor readings.
 
     Attributes:
@@ -62,7 +62,7 @@ class IdealMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class ContactMotion:
+class RunsWithAndWithoutContact:
     """Recorded contact transition, and the same movement without the sheet spring.
 
     Attributes:
@@ -85,20 +85,22 @@ class ContactMotion:
 
 def simulate_free_motion(
     scenario: Scenario, estimate: Array, progress: UpdateProgress
-) -> FreeMotion:
+) -> FreeMotionRun:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _run_station(scenario, estimate, progress)
     scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
-    return FreeMotion(scenario, result, scaled)
+    return FreeMotionRun(scenario, result, scaled)
 
 
-def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
+def simulate_contact(
+    scenario: Scenario, estimate: Array, stage: StartStage
+) -> RunsWithAndWithoutContact:
     """Simulate the contact transition with and without the sheet spring."""
     touched = _run_station(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
-    free = _run_station(without_leaf_spring(scenario), estimate, free_stage)
+    free = _run_station(without_leaf_spring_with_next_seed(scenario), estimate, free_stage)
     calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
-    return ContactMotion(
+    return RunsWithAndWithoutContact(
         scenario=scenario,
         contact_result=touched,
         free_result=free,
@@ -111,7 +113,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> 
     )
 
 
-def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
+def simulate_ideal_motion(progress: UpdateProgress) -> IdealSensorRun:
     """Simulate a movement along and about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES_MOTION], simulation__duration=0.4
@@ -139,10 +141,10 @@ def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
     taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
     started = taken >= 0
     _, s, omega, alpha = (part[started] for part in sensor_samples(result))
-    return IdealMotion(wrenches[taken[started]], (s, omega, alpha), phi)
+    return IdealSensorRun(wrenches[taken[started]], (s, omega, alpha), phi)
 
 
-def ideal_values(run: IdealMotion) -> NamedValues:
+def wrench_errors_of_ideal_run(run: IdealSensorRun) -> NamedValues:
     """Return peak wrenches and the errors of the calculated load wrench, by name."""
     load = regressor(*run.sensor_motion) @ run.phi
     left = np.concatenate(
@@ -159,7 +161,7 @@ def ideal_values(run: IdealMotion) -> NamedValues:
     }
 
 
-def free_values(run: FreeMotion, component: int, unit: str) -> NamedValues:
+def peaks_and_residuals_of_free_run(run: FreeMotionRun, component: int, unit: str) -> NamedValues:
     """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
     raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
@@ -175,7 +177,7 @@ def free_values(run: FreeMotion, component: int, unit: str) -> NamedValues:
     }
 
 
-def contact_values(run: ContactMotion) -> NamedValues:
+def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedValues:
     t, force_norm = run.contact_result.t, _force_norms(run.calculated_wrench)
     detected = force_norm > run.threshold_N
     window = _contact_window(run)
@@ -184,7 +186,7 @@ def contact_values(run: ContactMotion) -> NamedValues:
         "true_s": _time_of_first_true(t, run.in_contact),
         "detected_s": _time_of_first_true(t, detected),
         "threshold_N": run.threshold_N,
-        "raw_detectable": bool(raw_force_beyond_free_range(run).max() > 0),
+        "raw_detectable": bool(largest_raw_force_beyond_free_range(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
         "peak_contact_N": float(force_norm.max()),
         "peak_true_contact_N": _largest_norm(run.contact_result["true_contact_wrench_W"][:, :3]),
@@ -196,7 +198,7 @@ def contact_values(run: ContactMotion) -> NamedValues:
     }
 
 
-def raw_force_beyond_free_range(run: ContactMotion) -> Array:
+def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norms(raw)])
@@ -209,9 +211,9 @@ def raw_force_beyond_free_range(run: ContactMotion) -> Array:
     )
 
 
-def identification_values(load: LoadIdentification, scenario: Scenario) -> NamedValues:
+def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> NamedValues:
     """Return errors and expected accuracy of the load estimate, by name."""
-    truth = true_parameters(scenario)
+    truth = true_offsets_and_phi(scenario)
     error = load.estimate - truth
     mass, moment = load.estimate[6], load.estimate[7:10]
     true_mass, true_moment = truth[6], truth[7:10]
@@ -224,14 +226,14 @@ def identification_values(load: LoadIdentification, scenario: Scenario) -> Named
         "offset_error_N": float(np.linalg.norm(error[:3])),
         "offset_error_Nm": float(np.linalg.norm(error[3:6])),
         "mass_std_percent": 100 * float(deviations[6] / mass),
-        "recursive_against_batch_std": load.recursive_against_batch,
+        "recursive_against_batch_std": load.max_recursive_minus_batch_in_stds,
         "kappa_w10": load.kappa_w10,
         "duration_s": load.trajectory.period,
         "samples": load.batch.samples,
     }
 
 
-def without_leaf_spring(scenario: Scenario) -> Scenario:
+def without_leaf_spring_with_next_seed(scenario: Scenario) -> Scenario:
     """Return the scenario without the sheet spring, with the next seed."""
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
@@ -241,7 +243,7 @@ def _run_station(scenario: Scenario, estimate: Array, progress: UpdateProgress) 
     return simulate(station, scenario.simulation, progress=progress)
 
 
-def true_parameters(scenario: Scenario) -> Array:
+def true_offsets_and_phi(scenario: Scenario) -> Array:
     """Return the true sensor offsets and phi (16,) of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
@@ -253,7 +255,7 @@ def _scaled_wrench_at_slave(result: SimulationResult, estimate: Array, sigma: fl
     return scaled_wrench(wrench, offsets, s, omega, alpha, phi, no_object, **scales)
 
 
-def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
+def _contact_window(run: RunsWithAndWithoutContact) -> NDArray[np.bool_]:
     t = run.contact_result.t
     if not run.in_contact.any():
         return run.in_contact
@@ -261,7 +263,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
     return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
 
 
-def time_of_free_reversal(run: ContactMotion) -> float | None:
+def time_of_largest_raw_force_after_contact(run: RunsWithAndWithoutContact) -> float | None:
     """Return the time of the largest raw force after contact [s], or None."""
     t, force_norm = run.contact_result.t, _force_norms(run.measured_wrench)
     window = _contact_window(run)

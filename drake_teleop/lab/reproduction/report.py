@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.html import write_report_page
+from drake_teleop.common.html import write_report_page_and_pictures
 
 # Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETER_FORMATS = (
@@ -89,38 +89,38 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
     return [
-        _range_row("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
-                   s["free_force.peak_raw_N"], "N", 90, 115),
-        _range_row("set", "Fig. 6: the same at the master", "about 5.7 N",
-                   s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
-        _range_row("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
-                   s["free_force.half_ratio"], "", 0.48, 0.52),
-        _range_row("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
-                   s["free_force.residual_max_N"], "N", 0, 5),
-        _unrated_row("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
-                     s["free_torque.peak_raw_Nm"], "N m"),
-        _range_row("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
-                   s["free_torque.half_ratio"], "", 0.48, 0.52),
-        _unrated_row("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
-                     s["free_torque.residual_max_Nm"], "N m"),
-        _range_row("found", "All axes, ideal sensor, true φ: force left", _NOT_REPORTED,
-                   s["ideal.residual_max_N"], "N", 0, 1e-9),
-        _range_row("found", "All axes, ideal sensor, true φ: torque left", _NOT_REPORTED,
-                   s["ideal.residual_max_Nm"], "N m", 0, 1e-9),
-        _range_row("set", "Fig. 8: contact is made at", "about 220 ms",
-                   1e3 * s["contact.true_s"], "ms", 205, 235),
-        _range_row("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
-                   delay_ms, "ms", 0, 10),
-        _yes_no_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
-                    s["contact.raw_detectable"], False),
-        _yes_no_row("Fig. 8: false alarm at about 600 ms", "no contact there",
-                    s["contact.false_alarm_0_6_s"], False),
-        _range_row("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
-                   share, "", 0, 0.7),
-        _range_row("found", "Mass, error of the estimate", _NOT_REPORTED,
-                   s["identification.mass_error_percent"], "%", 0, 0.2),
-        _range_row("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
-                   s["identification.com_error_mm"], "mm", 0, 0.5),
+        _compare_range("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
+                       s["free_force.peak_raw_N"], "N", 90, 115),
+        _compare_range("set", "Fig. 6: the same at the master", "about 5.7 N",
+                       s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
+        _compare_range("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
+                       s["free_force.half_ratio"], "", 0.48, 0.52),
+        _compare_range("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
+                       s["free_force.residual_max_N"], "N", 0, 5),
+        _show_unrated("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
+                      s["free_torque.peak_raw_Nm"], "N m"),
+        _compare_range("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
+                       s["free_torque.half_ratio"], "", 0.48, 0.52),
+        _show_unrated("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
+                      s["free_torque.residual_max_Nm"], "N m"),
+        _compare_range("found", "All axes, ideal sensor, true φ: force left", _NOT_REPORTED,
+                       s["ideal.residual_max_N"], "N", 0, 1e-9),
+        _compare_range("found", "All axes, ideal sensor, true φ: torque left", _NOT_REPORTED,
+                       s["ideal.residual_max_Nm"], "N m", 0, 1e-9),
+        _compare_range("set", "Fig. 8: contact is made at", "about 220 ms",
+                       1e3 * s["contact.true_s"], "ms", 205, 235),
+        _compare_range("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
+                       delay_ms, "ms", 0, 10),
+        _compare_yes_no("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+                        s["contact.raw_detectable"], False),
+        _compare_yes_no("Fig. 8: false alarm at about 600 ms", "no contact there",
+                        s["contact.false_alarm_0_6_s"], False),
+        _compare_range("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
+                       share, "", 0, 0.7),
+        _compare_range("found", "Mass, error of the estimate", _NOT_REPORTED,
+                       s["identification.mass_error_percent"], "%", 0, 0.2),
+        _compare_range("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
+                       s["identification.com_error_mm"], "mm", 0, 0.5),
     ]  # fmt: skip
 
 
@@ -199,7 +199,7 @@ def write_report(
 ) -> None:
     """Write the figures (fig6 to fig8), and report.html with them and a link to replay.html."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
-    write_report_page(
+    write_report_page_and_pictures(
         out,
         "drake_teleop.lab.reproduction",
         pictures,
@@ -229,7 +229,7 @@ def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _range_row(
+def _compare_range(
     origin: str, what: str, paper: str, value: float, unit: str, low: float, high: float
 ) -> Comparison:
     bounds = f"at most {high:.3g} {unit}" if low == 0 else f"{low:.3g} to {high:.3g} {unit}"
@@ -237,12 +237,12 @@ def _range_row(
     return Comparison(what, paper, _format_value(value, unit), origin, bounds.strip(), holds)
 
 
-def _yes_no_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
+def _compare_yes_no(what: str, paper: str, value: bool, expected: bool) -> Comparison:
     words, holds = {True: "yes", False: "no"}, bool(value) == expected
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 
 
-def _unrated_row(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
+def _show_unrated(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
     return Comparison(what, paper, _format_value(value, unit), origin, "", None)
 
 

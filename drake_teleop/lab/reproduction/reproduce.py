@@ -22,19 +22,19 @@ from drake_teleop.lab.identification import (
 )
 from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
-    ContactMotion,
-    FreeMotion,
+    FreeMotionRun,
     NamedValues,
-    contact_values,
-    free_values,
-    ideal_values,
-    identification_values,
+    RunsWithAndWithoutContact,
+    detection_and_peaks_of_contact_run,
+    errors_of_identification,
+    peaks_and_residuals_of_free_run,
     simulate_contact,
     simulate_free_motion,
     simulate_ideal_motion,
-    time_of_free_reversal,
-    true_parameters,
-    without_leaf_spring,
+    time_of_largest_raw_force_after_contact,
+    true_offsets_and_phi,
+    without_leaf_spring_with_next_seed,
+    wrench_errors_of_ideal_run,
 )
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
@@ -45,8 +45,8 @@ from drake_teleop.lab.reproduction.report import (
     write_report,
 )
 from drake_teleop.lab.reproduction.speed import (
-    MakeBarePlant,
-    MakeMovingStation,
+    MakeBarePlantSimulator,
+    MakeSettledStationSimulator,
     cpu_time_per_simulated_second,
 )
 from drake_teleop.station.replay import write_replay
@@ -84,11 +84,11 @@ def reproduce_command(
         ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
         contact_run = simulate_contact(contact, load.estimate, stage)
         summary = {
-            "free_force": free_values(force_run, _FORCE_Z_INDEX, "N"),
-            "free_torque": free_values(torque_run, _TORQUE_X_INDEX, "Nm"),
-            "ideal": ideal_values(ideal_run),
-            "contact": contact_values(contact_run),
-            "identification": identification_values(load, force),
+            "free_force": peaks_and_residuals_of_free_run(force_run, _FORCE_Z_INDEX, "N"),
+            "free_torque": peaks_and_residuals_of_free_run(torque_run, _TORQUE_X_INDEX, "Nm"),
+            "ideal": wrench_errors_of_ideal_run(ideal_run),
+            "contact": detection_and_peaks_of_contact_run(contact_run),
+            "identification": errors_of_identification(load, force),
         }
         session = {"speed": _measure_simulation_speed(stage("Measure the speed"))}
         pictures = draw_figures(force_run, torque_run, contact_run, summary)
@@ -104,7 +104,10 @@ def reproduce_command(
 
 
 def draw_figures(
-    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: NamedValues
+    force: FreeMotionRun,
+    torque: FreeMotionRun,
+    contact: RunsWithAndWithoutContact,
+    summary: NamedValues,
 ) -> dict[str, Figure]:
     pictures = {
         name: scaling_figure(
@@ -129,7 +132,7 @@ def draw_figures(
         contact=contact.in_contact,
         detected_s=math.nan if detected is None else detected,
         threshold=contact.threshold_N,
-        turning_s=time_of_free_reversal(contact),
+        turning_s=time_of_largest_raw_force_after_contact(contact),
     )
     return pictures
 
@@ -137,7 +140,11 @@ def draw_figures(
 def _measure_simulation_speed(progress: UpdateProgress) -> NamedValues:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_time_per_simulated_second(
-        {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
+        {
+            "bare": MakeBarePlantSimulator(scenario),
+            "station": MakeSettledStationSimulator(scenario),
+        },
+        progress=progress,
     )
     return {
         "real_time_factor": 1 / cost["station"],
@@ -150,7 +157,7 @@ def _write_results(
     seed: int,
     summary: NamedValues,
     load: LoadIdentification,
-    runs: tuple[FreeMotion, FreeMotion, ContactMotion],
+    runs: tuple[FreeMotionRun, FreeMotionRun, RunsWithAndWithoutContact],
     pictures: dict[str, Figure],
 ) -> None:
     force, torque, contact = runs
@@ -163,7 +170,7 @@ def _write_results(
         (
             "contact_transition_without_sheet",
             contact.free_result,
-            without_leaf_spring(contact.scenario),
+            without_leaf_spring_with_next_seed(contact.scenario),
         ),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
@@ -181,7 +188,7 @@ def _write_results(
         setup=_describe_setup(seed, force.scenario, load),
         summary=figures,
         parameters=parameter_rows(
-            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
+            true_offsets_and_phi(force.scenario), load.estimate, load.batch.standard_deviations
         ),
     )
 

@@ -18,7 +18,7 @@ from drake_teleop.station.station import MakeTeleopStation
 _NUM_TIMINGS, _SIMULATED_TIME_PER_TIMING_S = 11, 0.1  # simulated time of one measurement [s]
 
 
-def MakeBarePlant(scenario: Scenario) -> Simulator:
+def MakeBarePlantSimulator(scenario: Scenario) -> Simulator:
     """Return a simulator of arm and tool under constant holding torque."""
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, scenario.slave, None)
@@ -34,7 +34,7 @@ def MakeBarePlant(scenario: Scenario) -> Simulator:
     return simulator
 
 
-def MakeMovingStation(scenario: Scenario) -> Simulator:
+def MakeSettledStationSimulator(scenario: Scenario) -> Simulator:
     """Return a simulator of the station, advanced to the end of its settling time."""
     # The value of the estimate does not change the cost.
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))

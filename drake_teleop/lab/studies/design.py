@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
+from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.measures import MEASURES, default_measures
@@ -121,7 +121,7 @@ class Study:
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "threshold of time_above_force_s")
 
     def check(self, where: str) -> None:
-        check_ranges(self, where)
+        check_all_field_values(self, where)
         for name in self.measures:
             if name not in MEASURES:
                 raise DrakeTeleopError(

@@ -46,7 +46,9 @@ class Factorial:
     counts: list[int]
     has_value: BooleanArray
 
-    def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparable_levels_and_weights(
+        self, *shown: int
+    ) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
 
         For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
@@ -64,7 +66,9 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        means = [self.comparable_levels(factor)[2] for factor in range(len(self.counts))]
+        means = [
+            self.comparable_levels_and_weights(factor)[2] for factor in range(len(self.counts))
+        ]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
@@ -250,7 +254,7 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
-            is_compared, combinations, weights = self.model.comparable_levels(factor)
+            is_compared, combinations, weights = self.model.comparable_levels_and_weights(factor)
             if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
@@ -269,7 +273,7 @@ class _MeasureData:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.comparable_levels(first, second)
+        is_compared, combinations, weights = self.model.comparable_levels_and_weights(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.

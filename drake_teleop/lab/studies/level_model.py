@@ -119,7 +119,9 @@ class LevelModel:
     X: Array
     pseudo_inverse: Array
 
-    def comparable_levels(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparable_levels_and_weights(
+        self, *shown: int
+    ) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return the same as `Factorial`, but with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
@@ -138,7 +140,9 @@ class LevelModel:
 
         `table` (points, seeds) contains the measure.
         """
-        means = [self.comparable_levels(factor)[2] for factor in range(len(self.factors))]
+        means = [
+            self.comparable_levels_and_weights(factor)[2] for factor in range(len(self.factors))
+        ]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
         coefficients = self.pseudo_inverse @ table.mean(axis=1)

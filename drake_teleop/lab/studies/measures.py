@@ -35,7 +35,7 @@ def _work_of_hand_on_device(result: SimulationResult, threshold: float) -> float
     return float(np.trapezoid(power, result.t))
 
 
-def _time_of_felt_force_above(result: SimulationResult, threshold: float) -> float:
+def _time_of_rendered_force_above(result: SimulationResult, threshold: float) -> float:
     above = np.linalg.norm(_force_to_master(result), axis=1) > threshold
     return float(np.trapezoid(above.astype(float), result.t))
 
@@ -52,7 +52,7 @@ _MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = 
     # Work of the hand on the stylus: integral of F.v + tau.omega.
     "hand_work_J": _work_of_hand_on_device,
     # Time of a displayed force above the threshold.
-    "time_above_force_s": _time_of_felt_force_above,
+    "time_above_force_s": _time_of_rendered_force_above,
 }
 
 

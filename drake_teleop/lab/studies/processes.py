@@ -78,7 +78,7 @@ def _run_in_local_processes(
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
     while left:
-        marked = store.chunks_started_at_least(suspicious)
+        marked = store.first_runs_of_chunks_started_at_least(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
                 yield _run_rows_one_by_one(run, chunk, store)
@@ -90,7 +90,7 @@ def _run_in_local_processes(
                 yield found
         except BrokenExecutor as error:
             suspicious = 1
-            if not store.chunks_started_at_least(suspicious):
+            if not store.first_runs_of_chunks_started_at_least(suspicious):
                 raise DrakeTeleopError(
                     f"processes ended before their first run ({error})",
                     where="study",
@@ -129,16 +129,16 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
             found += next(_joblib_pool(2)([_joblib_task(run, [row], store)]))
         except BrokenExecutor:
             found.append(row | {"error": PROCESS_ENDED_ERROR})
-    store.clear_starts(chunk[0]["run"])
+    store.clear_chunk_starts(chunk[0]["run"])
     return found
 
 
 def _run_and_count_start(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
-    store.count_start(chunk[0]["run"])
+    store.count_chunk_start(chunk[0]["run"])
     try:
         return run(chunk)
     finally:
-        store.clear_starts(chunk[0]["run"])
+        store.clear_chunk_starts(chunk[0]["run"])
 
 
 def _exit_when_parent_ends(parent: int) -> None:

@@ -94,7 +94,7 @@ def run_study(
                 counter.start(stage("Study"), workers.num_workers)
                 new = points
                 while new:
-                    finished = store.finished_chunks()
+                    finished = store.first_runs_of_finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
                     for found in workers.run_chunks(run, left):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import whole_file
+from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.lab.studies.processes import Chunk
 from drake_teleop.lab.studies.store import Store, write_or_check_identity
 
@@ -62,7 +62,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         for part in Store(folder / "runs.parquet").part_files():
             _link_or_copy_file(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()
-    finished = store.finished_chunks()
+    finished = store.first_runs_of_finished_chunks()
     missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
     if missing:
         count = max(shard.total for shard in shards)
@@ -80,7 +80,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
 def _link_or_copy_file(part: Path, path: Path, aside: Path) -> None:
     if path.exists():
         return
-    with whole_file(path, aside=aside) as temporary:
+    with replace_file_on_success(path, aside=aside) as temporary:
         try:
             os.link(part, temporary)
         except OSError:  # a file system without links

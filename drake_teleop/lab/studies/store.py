@@ -30,7 +30,7 @@ class Store:
 
     folder: Path
 
-    def finished_chunks(self) -> set[int]:
+    def first_runs_of_finished_chunks(self) -> set[int]:
         """Return the first run of each stored chunk."""
         return set(map(_first_run_of_part, self.part_files()))
 
@@ -40,15 +40,15 @@ class Store:
 
     def remove_damaged_parts(self) -> None:
         parts = self.part_files()
-        whole = _read_run_numbers(parts)
+        whole = _read_run_numbers_if_undamaged(parts)
         for part in parts:
-            if not {_first_run_of_part(part)} & (whole or _read_run_numbers([part])):
+            if not {_first_run_of_part(part)} & (whole or _read_run_numbers_if_undamaged([part])):
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
         write_table(self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, aside=self.folder)
 
-    def count_start(self, run: int) -> None:
+    def count_chunk_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""
         path = self._start_counts_folder / str(run)
         with wrap_write_errors(path):
@@ -56,10 +56,10 @@ class Store:
             with path.open("ab") as mark:
                 mark.write(b".")
 
-    def clear_starts(self, run: int) -> None:
+    def clear_chunk_starts(self, run: int) -> None:
         (self._start_counts_folder / str(run)).unlink(missing_ok=True)
 
-    def chunks_started_at_least(self, times: int) -> set[int]:
+    def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
         """Return the first runs of unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
@@ -85,7 +85,7 @@ def _first_run_of_part(part: Path) -> int:
     return int(part.stem.removeprefix("run_"))
 
 
-def _read_run_numbers(parts: list[Path]) -> set[int]:
+def _read_run_numbers_if_undamaged(parts: list[Path]) -> set[int]:
     import polars as pl
 
     if parts:

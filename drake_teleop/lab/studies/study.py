@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop.common.config import check_ranges, with_absolute_paths
+from drake_teleop.common.config import check_all_field_values, with_absolute_paths
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
@@ -28,7 +28,7 @@ from drake_teleop.station.scenario import (
     ScenarioNames,
     find_shipped_file,
     referenced_files,
-    settings_from_data,
+    settings_without_range_check,
 )
 
 if TYPE_CHECKING:
@@ -109,8 +109,8 @@ def study_command(
         for value in (factor.low, factor.high) if ranged else factor.level_values():
             changed = _set_scenario_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
-            config = settings_from_data(Scenario, changed, place)
-            check_ranges(config, place)
+            config = settings_without_range_check(Scenario, changed, place)
+            check_all_field_values(config, place)
             files += referenced_files(with_absolute_paths(config, Path(where).parent))
     digests = [sha256(file.read_bytes()).hexdigest() for file in dict.fromkeys(files)]
     work = StationRunFunction(data, where, tuple(study.measures), study.force_threshold)
@@ -136,7 +136,7 @@ def study_command(
 def LoadStudy(path: str | Path) -> Study:
     """Load a study file and check everything that does not depend on the scenario."""
     path = find_shipped_file("study", path, studies_dir())
-    study = settings_from_data(Study, read_yaml(path), str(path))
+    study = settings_without_range_check(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
 

@@ -37,8 +37,8 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
 MAX_REST_FORCE_N = 0.05
-"""Largest rendered force above `REST_BAND_HZ` of a station at rest, free or pressing, rms [N]."""
-REST_BAND_HZ = 5.0
+"""Rms of the rendered force above `MIN_REST_FORCE_FREQUENCY_HZ` that is accepted at rest [N]."""
+MIN_REST_FORCE_FREQUENCY_HZ = 5.0
 MAX_RENDERED_FORCE_ERROR = 0.1
 """Largest accepted error of the rendered force, as a share of the scaled contact force."""
 MAX_TUNED_FORCE_ERROR = 0.075
@@ -95,7 +95,7 @@ def settings_from_values(values: FactorValues) -> TunedSettings:
 
 
 @dataclass(frozen=True)
-class StationTrial:
+class StationPressTrial:
     """Function that a study runs: one press in the whole station.
 
     Args:
@@ -123,7 +123,7 @@ class StationTrial:
             scenario.passivity,
             wall,
             task=task,
-            depth=press_depth(self.base_scenario, grip),
+            depth=renderable_press_depth(self.base_scenario, grip),
         )
         setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
@@ -141,8 +141,8 @@ class StationTrial:
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
-            rms_above_hz(felt, period, REST_BAND_HZ),
-            *(rms_above_hz(force, period, REST_BAND_HZ) for force in free_felt),
+            rms_above_hz(felt, period, MIN_REST_FORCE_FREQUENCY_HZ),
+            *(rms_above_hz(force, period, MIN_REST_FORCE_FREQUENCY_HZ) for force in free_felt),
         )
         share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
         human = self.base_scenario.operator.perception
@@ -158,7 +158,7 @@ class StationTrial:
 
 
 @dataclass(frozen=True)
-class GammaSearch:
+class OneAxisGammaSearch:
     """Function that a study runs: the largest gamma that is stable in one axis at all corners.
 
     `gamma_upper_bounds`: low-pass [Hz] -> largest tried gamma.
@@ -183,7 +183,7 @@ class GammaSearch:
             for corner in self.stated_set.corners:
                 found = self.share_in_one_axis(axis, settings, gamma, *corner, seed)
                 share = min(share, found)
-                if not renders_force(found, MAX_TUNED_FORCE_ERROR):
+                if not is_rendered_share_accepted(found, MAX_TUNED_FORCE_ERROR):
                     return -1.0
             shares[gamma] = share
             return 1.0
@@ -247,11 +247,11 @@ class GammaSearch:
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
         force, period = run.hand_force[hold], run.t[1] - run.t[0]
-        quiet = rms_above_hz(force, period, REST_BAND_HZ) <= MAX_REST_FORCE_N
+        quiet = rms_above_hz(force, period, MIN_REST_FORCE_FREQUENCY_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
-def renders_force(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
+def is_rendered_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     """Return whether a rendered share of the scaled contact force is accepted."""
     return abs(share - 1.0) <= max_error
 
@@ -272,7 +272,7 @@ def short_press_task(round_trip: float) -> Task:
     )
 
 
-def press_depth(base: Scenario, grip: str) -> float:
+def renderable_press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force

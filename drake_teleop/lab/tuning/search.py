@@ -26,10 +26,10 @@ from drake_teleop.lab.tuning.press_trial import (
     MAX_TUNED_FORCE_ERROR,
     SEARCH_MEASURES,
     TRIAL_MEASURES,
-    GammaSearch,
-    StationTrial,
+    OneAxisGammaSearch,
+    StationPressTrial,
     TunedSettings,
-    renders_force,
+    is_rendered_share_accepted,
     settings_from_values,
 )
 
@@ -43,7 +43,9 @@ _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
 _MAX_MARGIN = 16.0  # factor of gamma at which the search for a failure ends
-_NOISE_STEP = 1.03  # gamma fails and holds by so much above and below that of accepted noise
+_GAMMA_STEP_ABOUT_NOISE_LIMIT = (
+    1.03  # gamma fails and holds by so much above and below that of accepted noise
+)
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -69,7 +71,7 @@ class SearchResult:
     beyond_runs: list[Row]
 
 
-def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
+def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest force."""
     base, stated = trial.base_scenario, trial.stated_set
     margin = stated.requirements.loop_gain_margin
@@ -101,7 +103,7 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
         ],
         measures=SEARCH_MEASURES,
     )
-    rows = execute("search", study, GammaSearch(base, stated, caps))
+    rows = execute("search", study, OneAxisGammaSearch(base, stated, caps))
     search = [_add_predicted_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
@@ -123,12 +125,12 @@ def search_settings(trial: StationTrial, execute: RunStudy) -> SearchResult:
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    stated_margin, held, beyond = _find_margin(chosen, trial, execute)
+    stated_margin, held, beyond = _find_gamma_margin_and_runs(chosen, trial, execute)
     return SearchResult(chosen, stated_margin, search, given, [*inside, *held], beyond)
 
 
-def _find_margin(
-    settings: TunedSettings, trial: StationTrial, execute: RunStudy
+def _find_gamma_margin_and_runs(
+    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row], list[Row]]:
     """Return the factor of gamma up to which the settings hold, these runs, and those beyond."""
     stated = trial.stated_set
@@ -156,7 +158,7 @@ def _find_margin(
 
 
 def _find_gamma_limit_in_station(
-    settings: TunedSettings, trial: StationTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
 
@@ -168,7 +170,9 @@ def _find_gamma_limit_in_station(
     inside: list[Row] = []
     while gamma >= smallest:
         rows: list[Row] = []
-        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
+        for seed, (factor, hands, walls) in enumerate(
+            trial.stated_set.tested_gamma_factors_grips_and_walls
+        ):
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
@@ -181,8 +185,8 @@ def _find_gamma_limit_in_station(
             if holds([row | {"rest_force_N": 0.0} for row in rows]):
                 # Noise grows with gamma.
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
-                smaller = max(smaller, quiet / _NOISE_STEP)
-                failed = min(failed, quiet * _NOISE_STEP)
+                smaller = max(smaller, quiet / _GAMMA_STEP_ABOUT_NOISE_LIMIT)
+                failed = min(failed, quiet * _GAMMA_STEP_ABOUT_NOISE_LIMIT)
         if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
@@ -194,7 +198,9 @@ def meets_requirements(
 ) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
-    return bool(row["rests"] and quiet and renders_force(row["share"], max_force_error))
+    return bool(
+        row["rests"] and quiet and is_rendered_share_accepted(row["share"], max_force_error)
+    )
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
@@ -215,7 +221,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+def _add_predicted_threshold(row: Row, trial: StationPressTrial, noises: dict[float, float]) -> Row:
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
     human, scale = (
         trial.base_scenario.operator.perception,
@@ -229,7 +235,7 @@ def _add_predicted_threshold(row: Row, trial: StationTrial, noises: dict[float, 
     return row | {"gamma": gamma, "threshold_N": float(threshold)}
 
 
-def _rms_load_force_in_swing(trial: StationTrial) -> float:
+def _rms_load_force_in_swing(trial: StationPressTrial) -> float:
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
     return float(trial.load_estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 

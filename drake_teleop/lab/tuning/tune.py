@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_teleop.common.files import (
-    check_inputs_are_kept,
     make_folder,
     output_folder,
+    refuse_to_replace_inputs,
     write_json,
     write_picture,
     write_text,
@@ -22,7 +22,7 @@ from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.tuning.press_trial import StationTrial, TunedSettings
+from drake_teleop.lab.tuning.press_trial import StationPressTrial, TunedSettings
 from drake_teleop.lab.tuning.search import (
     SearchResult,
     make_study_executor,
@@ -67,7 +67,7 @@ def tune(
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), make_stated_set(hands, walls, task)
     if not isinstance(scenario, Scenario):
-        check_inputs_are_kept(out / "tuned.yaml", scenario)
+        refuse_to_replace_inputs(out / "tuned.yaml", scenario)
     base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
@@ -75,7 +75,7 @@ def tune(
         load = identified_load(base, stage)
     own = dataclasses.replace(given, contact_detection=None)
     own = replace(own, simulation=base.simulation, operator=base.operator, channel=base.channel)
-    trial = StationTrial(own, base, stated, load.estimate)
+    trial = StationPressTrial(own, base, stated, load.estimate)
     basis = {
         "given": to_commented_yaml(given),
         "base": to_commented_yaml(base),

@@ -32,7 +32,7 @@ _FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 _MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
-def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
+def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
@@ -47,7 +47,7 @@ class Apparatus:
     load: IdentifiedLoad | None
     load_mass_at_hand: float
 
-    def stimulus_inputs(self, level: float, pressed: float) -> dict[str, int]:
+    def stimulus_scales_percent(self, level: float, pressed: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
         `level` is the rendered force [N] or mass [kg], `pressed` the expected contact force [N].
@@ -68,7 +68,7 @@ class Apparatus:
         self, shown: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
         """Return the result of an interval; `shown`: intended level (0: no stimulus)."""
-        force = rows.largest_contact_force()
+        force = rows.largest_mean_contact_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
                 force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
@@ -147,7 +147,7 @@ class IntervalLog:
         elif self.time - self._on_floor >= _MIN_SLOT_FLOOR_TIME_S:
             self.done_at = self._on_floor
 
-    def largest_contact_force(self) -> float:
+    def largest_mean_contact_force(self) -> float:
         """Return the largest 20 ms mean of the contact force [N]."""
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 

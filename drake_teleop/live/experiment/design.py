@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from drake_teleop.common.config import (
-    check_ranges,
+    check_all_field_values,
     choice,
     plain,
     quantity,
@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import (
     Scenario,
     ScenarioNames,
     find_shipped_file,
-    settings_from_data,
+    settings_without_range_check,
 )
 
 _EXPERIMENTS_FOLDER = Path(__file__).parent
@@ -126,7 +126,7 @@ class Experiment:
     simulated: SimulatedParticipant = field(default_factory=SimulatedParticipant)
 
     def check(self, where: str) -> None:
-        check_ranges(self, where)
+        check_all_field_values(self, where)
         for name in ("tasks", "conditions"):
             if not getattr(self, name):
                 raise DrakeTeleopError(
@@ -169,7 +169,7 @@ class Experiment:
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
     path = find_shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
-    experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
+    experiment = settings_without_range_check(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
     return experiment, [
         _load_task_scenario(task, path, index) for index, task in enumerate(experiment.tasks)

@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.live.experiment.apparatus import (
     Apparatus,
     IntervalLog,
-    load_of_scenario,
+    identified_load_unless_online,
     make_apparatus,
 )
 from drake_teleop.live.experiment.design import (
@@ -34,7 +34,7 @@ from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import contact_force, task_measures
+from drake_teleop.station.task_measures import task_measures, true_contact_force_magnitudes
 
 # Start of the hand's motion [s].
 _HAND_MOTION_START_S = 0.4
@@ -46,7 +46,7 @@ def make_apparatus_by_task_and_condition(
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = load_of_scenario(scenario)
+        load = identified_load_unless_online(scenario)
         for c, condition in enumerate(experiment.conditions):
             stations[t, c] = make_apparatus(task, condition, scenario, load)
     return stations
@@ -106,7 +106,9 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.stimulus_inputs(procedure.current_level, procedure.expected_contact_force)
+    stimulus = apparatus.stimulus_scales_percent(
+        procedure.current_level, procedure.expected_contact_force
+    )
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _HAND_MOTION_START_S
     while session.ms < 1e3 * task.interval:
@@ -149,4 +151,6 @@ def _run_peg_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure
     measures = task_measures(result, scenario)
     done = measures["success"] > 0.0
     time_s = measures["task_time_s"] if done else task.timeout
-    return IntervalResult(force_N=float(contact_force(result).max()), done=done, time_s=time_s)
+    return IntervalResult(
+        force_N=float(true_contact_force_magnitudes(result).max()), done=done, time_s=time_s
+    )

@@ -28,7 +28,7 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     """
     if is_physically_consistent(theta[6:]):
         return theta
-    unit = _parameter_units(theta[6:])
+    unit = _scales_of_phi(theta[6:])
     cross = gram[:6, 6:]
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
@@ -40,7 +40,7 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
-def _parameter_units(phi: Array) -> Array:
+def _scales_of_phi(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
         what = "the fitted mass is 0: the mass cannot be identified from this wrench"

@@ -16,8 +16,8 @@ from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
     EstimatorFit,
     EstimatorOptions,
-    NormalForm,
     SampleRecord,
+    SolvedNormalEquations,
     total_least_squares,
 )
 from drake_teleop.load.batch.uncertainty import (
@@ -77,13 +77,13 @@ def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorF
 
 
 def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_to_moments(
+    return _fit_moments_and_wrench_noise(
         record.moments, replace(options, noise=NoiseStd(options.noise.wrench)), record
     )
 
 
 def _fit_total_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_to_moments(record.moments, options, record)
+    return _fit_moments_and_wrench_noise(record.moments, options, record)
 
 
 def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -106,24 +106,27 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
-        rejected = _residuals_over_std(record, form.theta, options.shared_noise) > _REJECTION_STDS
+        rejected = (
+            _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
+            > _REJECTION_STDS
+        )
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
             return replace(whole, note=_NOTHING_REJECTED_NOTE)
-        fit = _fit_to_moments(moments, options, record)
+        fit = _fit_moments_and_wrench_noise(moments, options, record)
         form = fit.form
         if (rejected == previous).all():
             break
     return replace(fit, rejected=rejected)
 
 
-def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> NormalForm:
+def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> SolvedNormalEquations:
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
-        form = _fit_to_moments(moments, options, record).form
-        distances = _residuals_over_std(record, form.theta, options.shared_noise)
+        form = _fit_moments_and_wrench_noise(moments, options, record).form
+        distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
         weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
@@ -228,7 +231,7 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _fit_to_moments(
+def _fit_moments_and_wrench_noise(
     moments: SecondMoments, options: EstimatorOptions, record: SampleRecord
 ) -> EstimatorFit:
     noise, Z = options.noise, moments.mean_products
@@ -241,7 +244,7 @@ def _fit_to_moments(
         for known in (NoiseStd(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
             squares = np.diag(residual_covariance(Z, theta))
-            motion = moments.noise_covariance(noise, np.zeros(6))
+            motion = moments.mean_noise_covariance_of_z(noise, np.zeros(6))
             explained = np.diag(residual_covariance(motion, theta))
             if options.shared_noise:
                 squares, explained = (
@@ -254,7 +257,7 @@ def _fit_to_moments(
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _residuals_over_std(record: SampleRecord, theta: Array, shared: bool) -> Array:
+def _largest_residuals_over_robust_std(record: SampleRecord, theta: Array, shared: bool) -> Array:
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)

@@ -30,7 +30,7 @@ _MAX_REWEIGHTINGS, _THETA_TOLERANCE, _MIN_POLE_DISTANCE, _MIN_SIGNAL_STDS = 10, 
 _MIN_WRENCH_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
-class NormalForm(NamedTuple):
+class SolvedNormalEquations(NamedTuple):
     """Normal equations gram theta = right, and their solution theta = [offsets; phi] (16,).
 
     Attributes:
@@ -51,12 +51,12 @@ class NormalForm(NamedTuple):
 
 def total_least_squares(
     moments: SecondMoments, noise: NoiseStd, wrench_noise: Array, *, offsets: bool = True
-) -> NormalForm:
+) -> SolvedNormalEquations:
     """Return the total least squares fit of load and offsets to the moments of a record.
 
     `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
     """
-    Z, Q = moments.mean_products, moments.noise_covariance(noise, wrench_noise)
+    Z, Q = moments.mean_products, moments.mean_noise_covariance_of_z(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
         what = "the wrench is 0 throughout: the mass cannot be identified"
         remedy = "check that the sensor is connected and that its orientation changes"
@@ -76,7 +76,7 @@ def total_least_squares(
 
 def _solve_compensated_equations(
     Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float
-) -> NormalForm:
+) -> SolvedNormalEquations:
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
@@ -97,7 +97,7 @@ def _solve_compensated_equations(
         theta[:6] = 0.0
     gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
-    return NormalForm(
+    return SolvedNormalEquations(
         gram=(gram_basis * gain[kept]) @ gram_basis.T,
         right=gram_basis @ (basis[:, kept].T @ right),
         theta=theta,
@@ -165,7 +165,7 @@ class SampleRecord:
 class EstimatorFit:
     """Fit of an estimator: solution, wrench noise (6,) [N, N m], rejected samples (N,), note."""
 
-    form: NormalForm
+    form: SolvedNormalEquations
     wrench_noise: Array
     moments: SecondMoments
     rejected: NDArray[np.bool_]

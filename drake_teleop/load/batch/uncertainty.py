@@ -10,7 +10,11 @@ from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.total_least_squares import EstimatorFit, NormalForm, SampleRecord
+from drake_teleop.load.batch.total_least_squares import (
+    EstimatorFit,
+    SampleRecord,
+    SolvedNormalEquations,
+)
 from drake_teleop.load.identification import (
     MAX_IDENTIFIED_STD_SHARE,
     PARAMETER_NAMES,
@@ -53,7 +57,7 @@ def is_prior_dominated(standard_deviations: ArrayLike, prior_std: ArrayLike) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Combination:
+class ParameterCombination:
     """Linear combination of [offsets; phi] that a record determines.
 
     Attributes:
@@ -85,9 +89,9 @@ class BaseParameters:
         channels_with_slow_noise: names of wrench channels with drift.
     """
 
-    combinations: tuple[Combination, ...]
+    combinations: tuple[ParameterCombination, ...]
     parameters_without_influence: tuple[str, ...]
-    weak_directions: tuple[Combination, ...]
+    weak_directions: tuple[ParameterCombination, ...]
     channels_with_slow_noise: tuple[str, ...]
 
     @property
@@ -122,12 +126,14 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
     covariance, natural = equations.covariance(), natural_scales(load.phi)
     unexcited = equations.unexcited_columns
 
-    def scaled_combination(coefficients: Array, leading: int) -> Combination:
+    def scaled_combination(coefficients: Array, leading: int) -> ParameterCombination:
         c = coefficients / coefficients[leading]
         deviation = float(np.sqrt(max(0.0, c @ covariance @ c)))
         size = float(np.linalg.norm(c * natural))
         words = _combination_text(c, leading, np.abs(c) * natural)
-        return Combination(c, leading, float(c @ theta), deviation, deviation / size, words)
+        return ParameterCombination(
+            c, leading, float(c @ theta), deviation, deviation / size, words
+        )
 
     # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
     # the load as independent, so that the text begins with its parameters.
@@ -247,7 +253,7 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
 
 
 def covariance_of_solution(
-    least_squares_covariance: Array, form: NormalForm, offsets_estimated: bool
+    least_squares_covariance: Array, form: SolvedNormalEquations, offsets_estimated: bool
 ) -> Array:
     """Return the covariance (16, 16) of the solution of `form`."""
     unknown = np.isinf(np.diag(least_squares_covariance))

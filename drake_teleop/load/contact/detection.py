@@ -43,9 +43,9 @@ MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
 CUSUM_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
 shift to be detected is best; this value tolerates lasting errors of the load."""
-MAX_NOISE_LEVEL = 6.2
+NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES = 6.2
 """Level that normal noise reaches once in a million samples."""
-CONTACT_END_LEVEL = 0.7 * MAX_NOISE_LEVEL
+CONTACT_END_LEVEL = 0.7 * NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES
 """Level below which contact may end."""
 
 
@@ -129,7 +129,7 @@ def statistics_of_log(floor: NoiseFloor, *samples: ArrayLike, slack: float = CUS
 
 
 @njit(cache=True)
-def _sum_of_last_innovations(memory, hold, widths):
+def _normalized_sum_of_last_innovations(memory, hold, widths):
     m = 0
     while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
@@ -153,7 +153,7 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
     else:
         quiet = memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
         memory[QUIET_SAMPLES_INDEX] = quiet
-        if quiet > hold and _sum_of_last_innovations(memory, hold, widths) < leave:
+        if quiet > hold and _normalized_sum_of_last_innovations(memory, hold, widths) < leave:
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG_INDEX] = 0.0
             memory[CUSUM_START:] = 0.0

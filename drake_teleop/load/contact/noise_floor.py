@@ -171,7 +171,7 @@ def validate_detector_samples(*arrays: ArrayLike) -> list[Array]:
     return broadcast_to_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 
 
-def limit_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
+def limit_covariance_to_scales(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], with deviations up to `natural_scales`.
 
     `tared`: the offsets are from the same record; their variance is 0.

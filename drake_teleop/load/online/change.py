@@ -106,7 +106,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
 
 
 @njit(cache=True)
-def update_estimate(estimate, V, wrench, root):
+def update_estimate_by_block_mean(estimate, V, wrench, root):
     """Update [theta (16); covariance (256)] by a block mean, Eq. (T6); return its chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
@@ -143,12 +143,16 @@ def _update_filter(memory, filter_start, block, noise):
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
     V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
     before = memory[filter_start : filter_start + 272].copy()
-    chi = update_estimate(before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block))
+    chi = update_estimate_by_block_mean(
+        before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block)
+    )
     if noise[15] == 0.0:
         copy_into(memory, filter_start, before, 0, 272)
     else:
         long_term_root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
-        update_estimate(memory[filter_start : filter_start + 272], V, wrench, long_term_root)
+        update_estimate_by_block_mean(
+            memory[filter_start : filter_start + 272], V, wrench, long_term_root
+        )
     return chi
 
 
@@ -164,7 +168,7 @@ def _restart_filter_from_known_load(memory, filter_start):
 
 
 @njit(cache=True)
-def _is_identified(memory, mass_std_ratio):
+def _is_new_load_identified(memory, mass_std_ratio):
     theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
     P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN_LOAD_START + 6])
@@ -249,7 +253,7 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
         _restart_filter_from_known_load(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
         memory[_STATE_INDEX] = STATE_CHANGED
-    elif memory[_STATE_INDEX] == STATE_CHANGED and _is_identified(memory, mass_std_ratio):
+    elif memory[_STATE_INDEX] == STATE_CHANGED and _is_new_load_identified(memory, mass_std_ratio):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
         _inflate_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
@@ -318,7 +322,7 @@ def initial_change_memory(
     P[unknown, :] = P[:, unknown] = 0.0
     P[unknown, unknown] = prior[unknown]
     P[range(6), range(6)] += np.square(finite_array("offset_drift", offset_drift, 6))
-    # Undetermined inertias: those of a point mass, as in `logs.processing.usable_phi`.
+    # Undetermined inertias are those of a point mass, as in `phi_with_inertia_replaced`.
     phi = theta[6:].copy()
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])

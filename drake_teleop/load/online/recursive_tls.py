@@ -83,7 +83,7 @@ def add_outer_product(y, z, total):
 
 
 @njit(cache=True)
-def forget_samples(memory, theta, information, forgetting):
+def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
     """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
     last = memory.shape[0] - 1
     for i in range(last):
@@ -181,7 +181,7 @@ def eliminate_rows(A):
 
 
 @njit(cache=True)
-def solve_linear_system(A):
+def solve_augmented_system_in_place(A):
     """Replace the right part of [A B] by A^-1 B in place, A symmetric and positive definite."""
     n, m = A.shape
     for i in range(n):
@@ -196,14 +196,14 @@ def solve_linear_system(A):
 
 
 @njit(cache=True)
-def invert_matrix(S, A, W):
+def write_inverse_6x6(S, A, W):
     """Write S^-1 into W, both (6, 6); A (6, 12) is scratch memory."""
     for c in range(6):
         for d in range(6):
             A[c, d] = S[c, d]
             A[c, 6 + d] = 0.0
         A[c, 6 + c] = 1.0
-    solve_linear_system(A)
+    solve_augmented_system_in_place(A)
     for c in range(6):
         for d in range(6):
             W[c, d] = A[c, 6 + d]
@@ -260,7 +260,7 @@ def select_compensated_parameters(G, N, strength, K, taper):
 
 
 @njit(cache=True)
-def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
+def write_rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
     """Write [G g] into G, its part from noise into N; return the ratio of actual to given noise."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
@@ -268,7 +268,7 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
     for c in range(6):
         for d in range(6):
             S[c, d] /= Z[0, 0]
-    invert_matrix(S, inverse, W)
+    write_inverse_6x6(S, inverse, W)
     residual_products(Z, theta, index, factors, L, LZ, S)
     scale = 0.0
     for c in range(6):
@@ -296,10 +296,10 @@ def rtls_update(
     Z, options = memory[:19], (noise_std, motion_std, index, factors)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            forget_samples(memory, theta, information, forgetting)
+            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
         write_products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION], z)
         add_outer_product(z, z, Z)
-        scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
+        scale = write_rtls_normal_equations(Z, theta, *options, space, Q, G, N)
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
@@ -309,7 +309,7 @@ def rtls_update(
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
-        solve_linear_system(G)
+        solve_augmented_system_in_place(G)
         for i in range(16):
             theta[i] = G[i, 16]
 
@@ -373,7 +373,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
             allocate_scratch(),
             Q,
         )
-        scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
+        scale = write_rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
 
     def _update_state(self, theta: Array, memory: Array, samples: Array) -> None:

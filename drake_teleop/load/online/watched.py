@@ -74,7 +74,7 @@ def load_state_index(memory):
 
 
 @njit(cache=True)
-def _is_at_rest(memory, sample, period):
+def _update_and_test_rest(memory, sample, period):
     share = period / (_LOW_PASS_TIME_CONSTANT_S + period)
     s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
     shift, rate = 0.0, 0.0
@@ -91,7 +91,7 @@ def _is_at_rest(memory, sample, period):
 
 
 @njit(cache=True)
-def _force_has_changed(memory, residual, age, period):
+def _update_and_test_force_change(memory, residual, age, period):
     low_passed = memory[_RESIDUAL_START : _RESIDUAL_START + 3]
     lowest = memory[_LOWEST_FORCE_START:_HIGHEST_FORCE_START]
     highest = memory[_HIGHEST_FORCE_START:_CHANGED_SAMPLES_INDEX]
@@ -109,7 +109,7 @@ def _force_has_changed(memory, residual, age, period):
 
 
 @njit(cache=True)
-def _is_com_within_reach(known, new):
+def _is_com_of_change_within_reach(known, new):
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
     return moment < (MAX_COM_DISTANCE_M * (new[6] - known[6])) ** 2
 
@@ -128,8 +128,8 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    at_rest, verdict = _is_at_rest(memory, sample, period), current_change_state(watch)
-    force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
+    at_rest, verdict = _update_and_test_rest(memory, sample, period), current_change_state(watch)
+    force_changed = _update_and_test_force_change(memory, residual, new_load_age(watch), period)
     if verdict == STATE_KNOWN:
         memory[_STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
@@ -137,7 +137,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_within_reach(known, stored_new_load(watch))
+        near = _is_com_of_change_within_reach(known, stored_new_load(watch))
         other = verdict == STATE_CHANGED and force_changed and near
         memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)

@@ -19,7 +19,7 @@ from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
 )
 from drake_teleop.logs.causes.model import Model
-from drake_teleop.logs.causes.state import State
+from drake_teleop.logs.causes.state import FittedModel
 
 EXTENSIONS_BY_PLAUSIBILITY = (
     *("axes", "gravity", "weight", "torque factor", "offsets", "load", "linear drift", "gain"),
@@ -48,9 +48,9 @@ _MIN_DRIFT_OVER_NOISE = 3.0
 _NEGATIVE_INERTIA_OVER_DEVIATION, _NEGATIVE_INERTIA_OVER_SCALE = 8.0, 0.1
 _TORQUE_FACTOR_MARGIN, _MAX_TORQUE_FACTOR_ERROR, _MAX_EXTREME_TORQUE_FACTOR_ERROR = 0.02, 0.06, 0.2
 _MIN_USUAL_TORQUE_FACTOR, _EQUAL_LIKELIHOOD_TOLERANCE, _TORQUE_FACTOR_ITERATIONS = 0.2, 1.0, 4
-_DECISIVE_RESIDUAL_SHARE = 0.2
+_MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD = 0.2
 _MAX_LIKELIHOOD_LOSS_OF_OTHER_UNIT = 8.0  # of the logarithm; four standard deviations
-_MAX_SCORE_OF_UNKNOWN_UNIT = 30.0  # score that widens intervals but names no cause
+_SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +61,11 @@ class Candidate:
     """
 
     name: str
-    state: State
+    state: FittedModel
     score: float
 
 
-def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
+def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
     """Fit a model with each further extension, and yield those with sufficient effect.
 
     `first` is True in the first round of the search.
@@ -105,7 +105,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         )
     spans = find_contact_spans(state)
     if spans and spans != state.contact_spans:
-        larger = State.fit_record(data, model, state.x, spans)
+        larger = FittedModel.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
     if data.has_positions and "cable" not in model.extensions and data.accelerates_enough:
@@ -115,7 +115,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
 
 
 def _scored_candidate(
-    name: str, state: State, larger: State, *, times: int = 0, more: int = 0
+    name: str, state: FittedModel, larger: FittedModel, *, times: int = 0, more: int = 0
 ) -> Candidate:
     rows = float(state.data.used.sum())
     cost = larger.model.size - state.model.size + more
@@ -126,7 +126,10 @@ def _scored_candidate(
 
 
 def _fit_extension(
-    state: State, name: str, starts: list[Array | None], is_significant: Callable[[State], bool]
+    state: FittedModel,
+    name: str,
+    starts: list[Array | None],
+    is_significant: Callable[[FittedModel], bool],
 ) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
     fits = [state.refit(model, start) for start in starts]
@@ -135,11 +138,11 @@ def _fit_extension(
         yield _scored_candidate(name, state, best)
 
 
-def has_negative_mass(state: State) -> bool:
+def has_negative_mass(state: FittedModel) -> bool:
     return bool(state.x[6] < -4.0 * np.sqrt(state.covariance[6, 6]))
 
 
-def has_negative_inertia(state: State) -> bool:
+def has_negative_inertia(state: FittedModel) -> bool:
     if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(state.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -153,7 +156,7 @@ def has_negative_inertia(state: State) -> bool:
     return bool(least[0] < -max(_NEGATIVE_INERTIA_OVER_DEVIATION * deviation, smallest))
 
 
-def is_plausible(state: State) -> bool:
+def is_plausible(state: FittedModel) -> bool:
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.extensions, float(np.sqrt(state.covariance[6, 6]))
@@ -167,18 +170,18 @@ def is_plausible(state: State) -> bool:
     if "cable" in parts:
         if state.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * deviation:
             return False
-        return cable_stiffness(state) < _MAX_CABLE_STIFFNESS_N_M
+        return max_cable_stiffness_n_m(state) < _MAX_CABLE_STIFFNESS_N_M
     return True
 
 
-def cable_stiffness(state: State) -> float:
+def max_cable_stiffness_n_m(state: FittedModel) -> float:
     """Return the largest stiffness of a cable in any direction [N/m]."""
     K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     return float(np.abs(np.linalg.eigvalsh(K)).max())
 
 
-def _is_tilt_significant(state: State) -> bool:
-    _, angle, ratio = true_gravity_and_tilt(state)
+def _is_tilt_significant(state: FittedModel) -> bool:
+    _, angle, ratio = estimated_gravity_tilt_deg_and_size_ratio(state)
     error = abs(ratio - 1.0)
     # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > error
@@ -186,7 +189,7 @@ def _is_tilt_significant(state: State) -> bool:
     return bool(angle > _MIN_GRAVITY_TILT_DEG and error < share)
 
 
-def true_gravity_and_tilt(state: State) -> tuple[Array, float, float]:
+def estimated_gravity_tilt_deg_and_size_ratio(state: FittedModel) -> tuple[Array, float, float]:
     """Return the estimated gravity (3,), and its angle [deg] and ratio to the described one."""
     given = state.data.gravity_W
     assert given is not None
@@ -196,9 +199,9 @@ def true_gravity_and_tilt(state: State) -> tuple[Array, float, float]:
     return true, float(angle), float(sizes[0] / sizes[1])
 
 
-def start_parameters_of_tilt_fit(state: State) -> Array | None:
+def start_parameters_of_tilt_fit(state: FittedModel) -> Array | None:
     """Return start parameters for fitting a very wrong direction of gravity; None if unknown."""
-    y = state.data.select_rows(state.rows.used).y
+    y = state.data.with_other_rows_zeroed(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
     J = np.zeros((7, 3, width))
@@ -224,28 +227,28 @@ def start_parameters_of_tilt_fit(state: State) -> Array | None:
     return x
 
 
-def _extension_magnitude(state: State, name: str) -> float:
+def _extension_magnitude(state: FittedModel, name: str) -> float:
     return float(np.linalg.norm(state.parameters_of_extension(name)[0]))
 
 
-def _is_removed_weight_large(state: State) -> bool:
+def _is_removed_weight_large(state: FittedModel) -> bool:
     removed, _ = state.parameters_of_extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
     return bool(removed[0] > _MIN_REMOVED_MASS_SHARE * mass or moment > _MIN_REMOVED_MOMENT_ARM_M)
 
 
-def drift_amplitudes(state: State) -> Array:
+def drift_amplitudes(state: FittedModel) -> Array:
     """Return the largest drift (6,) of the offsets from their means [N, N m]."""
     name = "drift" if "drift" in state.model.extensions else "linear drift"
     return np.abs(state.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
 
 
-def _is_drift_significant(state: State) -> bool:
+def _is_drift_significant(state: FittedModel) -> bool:
     return bool((drift_amplitudes(state) > _MIN_DRIFT_OVER_NOISE * state.data.wrench_noise).any())
 
 
-def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
+def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     fits = []
     for factor in (1.0, *TORQUE_UNIT_FACTORS):
         model = replace(state.model, torque_factor=factor)
@@ -254,7 +257,9 @@ def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
     best = next(x for x in fits if x.likelihood > most - _EQUAL_LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
-    by_residual = least < _DECISIVE_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
+    by_residual = least < _MAX_RESIDUAL_SHARE_OVERRULING_LIKELIHOOD * min(
+        best.residual_ratio, state.residual_ratio
+    )
     if by_residual:
         low = (x for x in fits if x.residual_ratio < 2.0 * least)
         best = max(low, key=lambda x: x.likelihood)
@@ -272,11 +277,15 @@ def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _scored_candidate("torque factor", state, best, more=1)
     # A factor beside the known ratios is not a cause, but widens the intervals.
-    score = found.score if abs(value[0]) < limit else min(found.score, _MAX_SCORE_OF_UNKNOWN_UNIT)
+    score = (
+        found.score
+        if abs(value[0]) < limit
+        else min(found.score, _SCORE_LIMIT_OF_UNKNOWN_TORQUE_FACTOR)
+    )
     yield replace(found, score=score)
 
 
-def fits_with_other_torque_units(state: State) -> list[State]:
+def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
     """Return the fits with other torque units that explain the record nearly as well."""
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
@@ -287,8 +296,8 @@ def fits_with_other_torque_units(state: State) -> list[State]:
     return found
 
 
-def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
-    y = state.data.select_rows(state.rows.used).y[:, state.model.columns]
+def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
+    y = state.data.with_other_rows_zeroed(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
     sums = sums - np.outer(sums[:, CONSTANT_COLUMN], sums[CONSTANT_COLUMN]) / sums[0, 0]
     # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight

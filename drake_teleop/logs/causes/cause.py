@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import axis_names
+from drake_teleop.common.rotations import axis_names_of_rows
 from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.candidates import (
-    cable_stiffness,
     drift_amplitudes,
+    estimated_gravity_tilt_deg_and_size_ratio,
     fits_with_other_torque_units,
-    true_gravity_and_tilt,
+    max_cable_stiffness_n_m,
 )
-from drake_teleop.logs.causes.state import State
+from drake_teleop.logs.causes.state import FittedModel
 
 _MAX_HAND_CONTACT_TO_STEP_S, _MAX_HAND_CONTACT_DURATION_S = 0.8, 1.2
 CHANGE_CAUSES = ("zero change", "load change")
@@ -62,7 +62,7 @@ class RecordPartWithLoad:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cause]:
+def causes_of_fit(state: FittedModel, always_fitted: tuple[str, ...] = ()) -> list[Cause]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_wrong_axes_cause(model.axes))
@@ -90,7 +90,7 @@ def causes_of_fit(state: State, always_fitted: tuple[str, ...] = ()) -> list[Cau
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
-def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWithLoad]:
+def loads_between_changes(state: FittedModel, covariance: Array) -> list[RecordPartWithLoad]:
     """Return the parts of a record between load changes, with their loads; [] without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
@@ -115,15 +115,15 @@ def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
 
 
 def _wrong_axes_cause(Q: Array) -> Cause:
-    rows = axis_names(Q)
+    rows = axis_names_of_rows(Q)
     what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
         what = "the wrench has the opposite sign"
     return Cause("axes", what, values={"axes": rows, "matrix": Q.tolist()})
 
 
-def _gravity_direction_cause(state: State) -> Cause:
-    true, angle, _ = true_gravity_and_tilt(state)
+def _gravity_direction_cause(state: FittedModel) -> Cause:
+    true, angle, _ = estimated_gravity_tilt_deg_and_size_ratio(state)
     wide = direction_std_deg(true, state.parameters_of_extension("gravity")[1])
     return Cause(
         "gravity direction",
@@ -141,7 +141,7 @@ def direction_std_deg(x: Array, covariance: Array) -> float:
     return float(np.degrees(np.sqrt(spread) / size))
 
 
-def _removed_weight_cause(state: State) -> Cause:
+def _removed_weight_cause(state: FittedModel) -> Cause:
     removed, covariance = state.parameters_of_extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
@@ -165,7 +165,7 @@ def _removed_weight_cause(state: State) -> Cause:
     )
 
 
-def _torque_factor_cause(state: State) -> Cause:
+def _torque_factor_cause(state: FittedModel) -> Cause:
     factor = state.model.torque_factor
     if factor == -1.0:
         what = "the torque has the opposite sign"
@@ -177,7 +177,7 @@ def _torque_factor_cause(state: State) -> Cause:
     return Cause("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
 
 
-def _gain_error_cause(state: State, c: int) -> Cause:
+def _gain_error_cause(state: FittedModel, c: int) -> Cause:
     value, covariance = state.parameters_of_extension(f"gain {c}")
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
@@ -188,7 +188,7 @@ def _gain_error_cause(state: State, c: int) -> Cause:
     )
 
 
-def _pose_frame_cause(state: State) -> Cause:
+def _pose_frame_cause(state: FittedModel) -> Cause:
     r, covariance = state.parameters_of_extension("frame")
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
     return Cause(
@@ -199,7 +199,7 @@ def _pose_frame_cause(state: State) -> Cause:
     )
 
 
-def _sensor_rotation_cause(state: State) -> Cause:
+def _sensor_rotation_cause(state: FittedModel) -> Cause:
     rho, covariance = state.parameters_of_extension("rotation")
     angle = float(np.degrees(np.linalg.norm(rho)))
     wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
@@ -211,7 +211,7 @@ def _sensor_rotation_cause(state: State) -> Cause:
     )
 
 
-def _drift_cause(state: State) -> Cause:
+def _drift_cause(state: FittedModel) -> Cause:
     size = 2.0 * drift_amplitudes(state)
     return Cause(
         "drift",
@@ -221,8 +221,8 @@ def _drift_cause(state: State) -> Cause:
     )
 
 
-def _cable_cause(state: State) -> Cause:
-    stiffness = cable_stiffness(state)
+def _cable_cause(state: FittedModel) -> Cause:
+    stiffness = max_cable_stiffness_n_m(state)
     return Cause(
         "cable",
         f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
@@ -231,7 +231,7 @@ def _cable_cause(state: State) -> Cause:
     )
 
 
-def _offset_or_load_step_cause(state: State, i: int) -> Cause:
+def _offset_or_load_step_cause(state: FittedModel, i: int) -> Cause:
     step, (values, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":

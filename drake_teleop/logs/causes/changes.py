@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import WRENCH_SIGNALS
 from drake_teleop.logs.causes.model import DELAY_INDEX, StepChange
 from drake_teleop.logs.causes.state import (
-    State,
+    FittedModel,
     TimeSpans,
     is_in_time_spans,
     regularized_inverse,
@@ -23,7 +23,7 @@ from drake_teleop.logs.causes.state import (
 _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
 _STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-MIN_RAMP_SPAN_S = 0.5
+MIN_OMITTED_TIME_AROUND_RAMP_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
 _NUM_TRIED_STEP_TIMES = 2
 _MIN_STEP_OVER_DEVIATION = 5.0
@@ -32,15 +32,15 @@ _MIN_MASS_STEP_OVER_MASS = 0.01
 _MIN_MOMENT_STEP_OVER_MASS_M = 0.002
 
 
-def add_step(state: State, kind: str) -> State | None:
+def add_step(state: FittedModel, kind: str) -> FittedModel | None:
     """Return the model with one more change of "offsets" or "load" (`kind`), at its likeliest time.
 
     Return None if no change is significant.
     """
-    best: State | None = None
+    best: FittedModel | None = None
     for time in _likely_step_times(state, kind):
-        found = _refine_step_time(state, kind, time)
-        ramp = fit_with_ramps(state, [[kind]], [time], state.contact_spans)
+        found = _fit_with_refined_step_time(state, kind, time)
+        ramp = fit_steps_at_middle_of_ramps(state, [[kind]], [time], state.contact_spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _MIN_LIKELIHOOD_GAIN_OF_RAMP:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
@@ -49,8 +49,8 @@ def add_step(state: State, kind: str) -> State | None:
     return best if best is not None and _is_step_significant(best, last) else None
 
 
-def _likely_step_times(state: State, kind: str) -> list[float]:
-    data, rows = state.data, state.data.rows_per_block
+def _likely_step_times(state: FittedModel, kind: str) -> list[float]:
+    data, rows = state.data, state.data.rows_per_search_block
     scan = _StepScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.likelihood_gain_of_step_at(int(n)) for n in starts])
@@ -73,29 +73,32 @@ def _likely_step_times(state: State, kind: str) -> list[float]:
 class _StepScan:
     """Likelihood gain by a change of offsets or load at any instant, for white noise."""
 
-    def __init__(self, state: State, kind: str) -> None:
+    def __init__(self, state: FittedModel, kind: str) -> None:
         power = np.maximum(state.rows.residual_rms(state.residual), 1e-12)
         J = state.model.wrench_derivative(state.x) / power[:, None]
         self._columns = state.rows.y @ J.transpose(1, 2, 0)  # (6, M, p)
         self._residual = (state.rows.y @ (state.residual / power[:, None]).T).T
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
-        self._rows = rows = state.data.rows_per_block
+        self._rows = rows = state.data.rows_per_search_block
         starts = np.arange(0, len(state.data.t), rows)
         gram, right = map(
-            np.stack, zip(*(self._sums_of_rows(n, n + rows) for n in starts.tolist()), strict=True)
+            np.stack,
+            zip(
+                *(self._normal_equations_of_rows(n, n + rows) for n in starts.tolist()), strict=True
+            ),
         )
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
 
-    def _sums_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
+    def _normal_equations_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
         A, e = self._columns[:, start:stop], self._residual[:, start:stop]
         flat = A.reshape(-1, A.shape[2])
         return flat.T @ flat, flat.T @ e.ravel()
 
     def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
-        gram, right = self._sums_of_rows(n, j * self._rows)
+        gram, right = self._normal_equations_of_rows(n, j * self._rows)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -105,30 +108,33 @@ class _StepScan:
         return score_statistic(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
-def fit_with_ramps(
-    state: State,
+def fit_steps_at_middle_of_ramps(
+    state: FittedModel,
     kinds: Sequence[Sequence[str]],
     times: Sequence[float],
     spans: TimeSpans,
     widths: Sequence[float] | None = None,
-) -> State:
+) -> FittedModel:
     """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
-    widths = [max(MIN_RAMP_SPAN_S, w + MIN_RAMP_SPAN_S) for w in (widths or [0.0] * len(times))]
+    widths = [
+        max(MIN_OMITTED_TIME_AROUND_RAMP_S, w + MIN_OMITTED_TIME_AROUND_RAMP_S)
+        for w in (widths or [0.0] * len(times))
+    ]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
-    found = State.fit_record(
+    found = FittedModel.fit_record(
         state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
     )
     owners = [k for k, both in enumerate(kinds) for _ in both]
     middles = [_estimate_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
-    return State.fit_record(state.data, model, found.x, found.contact_spans)
+    return FittedModel.fit_record(state.data, model, found.x, found.contact_spans)
 
 
-def remove_small_steps(state: State) -> State:
+def remove_small_steps(state: FittedModel) -> FittedModel:
     """Remove insignificant changes of offsets or load one by one, and refit the model."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
@@ -138,17 +144,21 @@ def remove_small_steps(state: State) -> State:
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
         x = np.concatenate([state.x[: DELAY_INDEX + 1], np.zeros(model.size - DELAY_INDEX - 1)])
-        state = State.fit_record(state.data, model, x, state.contact_spans)
+        state = FittedModel.fit_record(state.data, model, x, state.contact_spans)
 
 
-def _squared_step_over_variance(state: State, i: int) -> float:
+def _squared_step_over_variance(state: FittedModel, i: int) -> float:
     where = state.model.parameter_slices[f"step {i}"]
     x, covariance = state.x[where], state.covariance[where, where]
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
 def _estimate_ramp_middle(
-    state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
+    state: FittedModel,
+    kinds: Sequence[Sequence[str]],
+    first: int,
+    k: int,
+    span: tuple[float, float],
 ) -> float:
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
@@ -169,8 +179,8 @@ def _estimate_ramp_middle(
     return span[1] - done * (span[1] - span[0])
 
 
-def _refine_step_time(state: State, kind: str, time: float) -> State:
-    def fit_with_step_at(time: float, start: Array | None = None) -> State:
+def _fit_with_refined_step_time(state: FittedModel, kind: str, time: float) -> FittedModel:
+    def fit_with_step_at(time: float, start: Array | None = None) -> FittedModel:
         model = replace(state.model, steps=(*state.model.steps, StepChange(kind, time)))
         return state.refit(model, start)
 
@@ -187,7 +197,7 @@ def _refine_step_time(state: State, kind: str, time: float) -> State:
     return best
 
 
-def _is_step_significant(state: State, i: int) -> bool:
+def _is_step_significant(state: FittedModel, i: int) -> bool:
     where = state.model.parameter_slices[f"step {i}"]
     values = state.x[where]
     deviations = np.sqrt(np.diag(state.covariance[where, where]))
@@ -214,16 +224,16 @@ _MAX_NUM_LOADS, _MAX_LOAD_STEPS, _MIN_CALM_RUN_BLOCKS, _MAX_UNFITTED_BLOCK_SHARE
 _MAX_STEP_OVER_CONTACT_RESIDUAL, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
 
-def find_contact_spans(state: State) -> TimeSpans:
+def find_contact_spans(state: FittedModel) -> TimeSpans:
     """Return time spans (start, stop) [s] of contact, whose residual far exceeds the usual one."""
-    blocks = _ResidualBlocks(state)
+    blocks = _NormalEquationsOfBlocks(state)
     contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
         return ()
     wide = contact_blocks.copy()
     wide[:-1] |= contact_blocks[1:]
     wide[1:] |= contact_blocks[:-1]
-    t, rows = state.data.t, state.data.rows_per_block
+    t, rows = state.data.t, state.data.rows_per_search_block
     half, last = 0.5 * float(t[1] - t[0]), len(t) - 1
     return tuple(
         (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
@@ -231,15 +241,15 @@ def find_contact_spans(state: State) -> TimeSpans:
     )
 
 
-def replace_contacts_by_steps(larger: State) -> State | None:
+def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
     """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
-    blocks = _ResidualBlocks(larger)
+    blocks = _NormalEquationsOfBlocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _keep_long_runs_of_true(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
+        calm = _keep_long_runs_and_fill_single_gaps(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
     if not len(inner) or left.sum() > _MAX_UNFITTED_BLOCK_SHARE * blocks.usable.sum():
@@ -247,17 +257,21 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
     if not 0 < len(borders) <= _MAX_LOAD_STEPS:
         return None
-    dt, rows = larger.data.dt, larger.data.rows_per_block
+    dt, rows = larger.data.dt, larger.data.rows_per_search_block
     t = larger.data.t[0] + dt * rows * np.arange(len(number))
     times = [float(0.5 * (t[a] + dt * rows + t[b])) for a, b in borders]
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
-    found = fit_with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
+    found = fit_steps_at_middle_of_ramps(
+        larger, [("offsets", "load")] * len(times), times, (), widths
+    )
     found = remove_small_steps(found)
     limit = max(_MAX_STEP_OVER_CONTACT_RESIDUAL * larger.residual_ratio, _SMALL_RESIDUAL_OVER_NOISE)
     return found if found.residual_ratio < limit else None
 
 
-def _keep_long_runs_of_true(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
+def _keep_long_runs_and_fill_single_gaps(
+    flags: NDArray[np.bool_], shortest: int
+) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
@@ -266,14 +280,14 @@ def _keep_long_runs_of_true(flags: NDArray[np.bool_], shortest: int) -> NDArray[
     return out
 
 
-class _ResidualBlocks:
-    def __init__(self, state: State) -> None:
+class _NormalEquationsOfBlocks:
+    def __init__(self, state: FittedModel) -> None:
         data = state.data
         self._state = state
         y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
-        sums = data.lagged_block_sums(y, rows=data.rows_per_block, lags=1)[:, 0]
+        sums = data.lagged_block_sums(y, rows=data.rows_per_search_block, lags=1)[:, 0]
         self._counts = sums[:, 0, 0]
-        self.usable = self._counts > 0.5 * data.rows_per_block
+        self.usable = self._counts > 0.5 * data.rows_per_search_block
         J = state.model.wrench_derivative(state.x)
         sizes = np.sqrt(np.diag(sums.sum(axis=0))[WRENCH_SIGNALS] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
@@ -290,19 +304,23 @@ class _ResidualBlocks:
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return True for blocks `among` with a residual far above the calmest; None for few."""
-        found = self._fit_calmest_blocks(np.flatnonzero(among))
+        found = self._residual_levels_by_fit_to_calm_blocks(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
-        by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
+        by_motion = _block_residuals_by_motion_errors(
+            self._state, self._state.x + move, excess, among, quantile
+        )
         usual = np.hypot(calm, by_motion)
         return np.asarray(
             (level > _CONTACT_RMS_OVER_NOISE) & (level > _CONTACT_RMS_OVER_CALM * usual) & among
         )
 
-    def _fit_calmest_blocks(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
+    def _residual_levels_by_fit_to_calm_blocks(
+        self, blocks: NDArray[np.intp]
+    ) -> tuple[Array, float, Array] | None:
         if len(blocks) < 2 * _MIN_TRIMMED_FIT_BLOCKS:
             return None
         starts = [blocks]
@@ -352,10 +370,10 @@ class _ResidualBlocks:
         return level, move, kept
 
 
-def _motion_error_level(
-    state: State, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
+def _block_residuals_by_motion_errors(
+    state: FittedModel, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
 ) -> Array:
-    data, rows = state.data, state.data.rows_per_block
+    data, rows = state.data, state.data.rows_per_search_block
     y = data.append_step_signals(state.model.step_times)
     wrench = y @ state.model.wrench_coefficients(x[None])[0].T
     bend = np.zeros(len(y))
@@ -371,7 +389,7 @@ def _motion_error_level(
     return np.asarray(2.0 * np.quantile(ratio, quantile) * fast)
 
 
-def replace_steps_by_contact(state: State) -> State:
+def replace_steps_by_contact(state: FittedModel) -> FittedModel:
     """Replace changes of the offsets by a contact if that explains the residual better."""
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
@@ -386,25 +404,25 @@ def replace_steps_by_contact(state: State) -> State:
         dt = state.data.dt
         span = (start - dt, stop + dt)
         if len(ends) == 2 and _is_offset_step_undone(state, i, j):
-            return State.fit_record(state.data, model, x, (*state.contact_spans, span))
+            return FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
         if _median_residual_over_noise(state, span) > _CONTACT_RMS_OVER_NOISE:
-            calm = State.fit_record(state.data, model, x, (*state.contact_spans, span))
+            calm = FittedModel.fit_record(state.data, model, x, (*state.contact_spans, span))
             limit = min(_CONTACT_RMS_OVER_CALM, state.residual_ratio / _CONTACT_RMS_OVER_CALM)
             if calm.residual_ratio < limit:
                 return shrink_contacts(calm)
     return state
 
 
-def shrink_contacts(state: State) -> State:
+def shrink_contacts(state: FittedModel) -> FittedModel:
     """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
     spans = [_shrunk_contact_span(state, span) for span in state.contact_spans]
-    return State.fit_record(
+    return FittedModel.fit_record(
         state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
     )
 
 
-def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
+def _shrunk_contact_span(state: FittedModel, span: tuple[float, float]) -> tuple[float, float]:
     data = state.data
     inside = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
@@ -417,7 +435,7 @@ def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float
     return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
 
 
-def _median_residual_over_noise(state: State, span: tuple[float, float]) -> float:
+def _median_residual_over_noise(state: FittedModel, span: tuple[float, float]) -> float:
     chosen = state.rows.used & is_in_time_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
@@ -425,7 +443,7 @@ def _median_residual_over_noise(state: State, span: tuple[float, float]) -> floa
     return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.wrench_noise, 1e-12)).max())
 
 
-def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
+def _is_offset_step_undone(state: FittedModel, i: int, j: int) -> bool:
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False

@@ -29,7 +29,7 @@ from drake_teleop.logs.causes.changes import (
     replace_steps_by_contact,
     shrink_contacts,
 )
-from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
+from drake_teleop.logs.causes.instants import BlockMeans, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     GOOD_SMOOTH_MISFIT,
     jackknife_load_deviations,
@@ -39,10 +39,10 @@ from drake_teleop.logs.causes.intervals import (
     load_deviations_if_unexplained,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, OFFSETS_AND_LOAD, Model
-from drake_teleop.logs.causes.state import State
+from drake_teleop.logs.causes.state import FittedModel
 
 MAX_SEARCH_ROUNDS = 4
-InstantsAtDelay = Callable[[float], Instants]
+BlockMeansAtDelay = Callable[[float], BlockMeans]
 _MIN_CORRECTED_DELAY_S = 5e-4
 _MAX_CORRECTED_DELAY_S = 0.3
 _EQUAL_DELAY_TOLERANCE_S = 0.004
@@ -64,7 +64,7 @@ _FLEXIBLE_CAUSES = ("cable", "drift")
 _FLEXIBLE_CAUSE_SCORE_MARGIN, _FLEXIBLE_CAUSE_SCORE_SHARE = 80.0, 0.1
 
 
-def residual_is_noise(state: State) -> bool:
+def residual_is_noise(state: FittedModel) -> bool:
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_NOISE_RESIDUAL_RATIO
@@ -81,11 +81,13 @@ def residual_is_noise(state: State) -> bool:
     return all(state.score_of_larger_model(x) < MAX_NOISE_EXTENSION_SCORE for x in larger)
 
 
-SearchResult = tuple[State, float, list[Candidate]]
+SearchResult = tuple[FittedModel, float, list[Candidate]]
 
 
 def search_causes(
-    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
+    data: BlockMeans,
+    with_delay: BlockMeansAtDelay | None = None,
+    always_fitted: tuple[str, ...] = (),
 ) -> SearchResult:
     """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
@@ -118,11 +120,11 @@ def search_causes(
     return repeated if better else found
 
 
-def _is_residual_much_smaller(state: State, other: State) -> bool:
+def _is_residual_much_smaller(state: FittedModel, other: FittedModel) -> bool:
     return state.residual_ratio < _MUCH_SMALLER_RESIDUAL * other.residual_ratio
 
 
-def may_be_coloured_noise(state: State) -> bool:
+def may_be_coloured_noise(state: FittedModel) -> bool:
     """Return whether the residual may be coloured noise: smooth signals do not explain it."""
     return (
         state.smooth_misfit < GOOD_SMOOTH_MISFIT
@@ -130,7 +132,7 @@ def may_be_coloured_noise(state: State) -> bool:
     )
 
 
-def is_clear_misfit(state: State) -> bool:
+def is_clear_misfit(state: FittedModel) -> bool:
     """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
     return (
         state.smooth_misfit > MAX_NOISE_SMOOTH_MISFIT
@@ -138,25 +140,27 @@ def is_clear_misfit(state: State) -> bool:
     )
 
 
-def _initial_state(data: Instants, model: Model) -> State:
-    state = State.fit_record(data, model)
+def _initial_state(data: BlockMeans, model: Model) -> FittedModel:
+    state = FittedModel.fit_record(data, model)
     start = start_parameters_of_tilt_fit(state) if "gravity" in model.extensions else None
-    return state if start is None else State.fit_record(data, state.model, start)
+    return state if start is None else FittedModel.fit_record(data, state.model, start)
 
 
 def _search_causes_from(
-    state: State, delay_s: float, with_delay: InstantsAtDelay | None
+    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
 ) -> SearchResult:
     state, delay_s = _apply_fitted_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
     for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
             return state, delay_s, []
-        found = _remove_cable_if_attenuated(list(fit_candidates(state, first=number == 0)))
+        found = _remove_cable_if_weight_explains_as_much(
+            list(fit_candidates(state, first=number == 0))
+        )
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]
-        winner = _best_candidate(effective)
-        calmest = _candidate_with_smallest_residual(state, rejected)
+        winner = _most_plausible_of_best_candidates(effective)
+        calmest = _candidate_with_much_smaller_residual(state, rejected)
         if winner is None or (
             calmest is not None
             and calmest.name != "contact"
@@ -182,7 +186,7 @@ def _search_causes_from(
     return state, delay_s, rejected
 
 
-def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
+def _remove_cable_if_weight_explains_as_much(found: list[Candidate]) -> list[Candidate]:
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
@@ -190,8 +194,8 @@ def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
 
 
 def _apply_fitted_delay(
-    state: State, delay_s: float, with_delay: InstantsAtDelay | None
-) -> tuple[State, float]:
+    state: FittedModel, delay_s: float, with_delay: BlockMeansAtDelay | None
+) -> tuple[FittedModel, float]:
     for _ in range(_MAX_DELAY_ITERATIONS):
         if (
             with_delay is None
@@ -202,11 +206,13 @@ def _apply_fitted_delay(
         delay_s += float(state.x[DELAY_INDEX])
         x = state.x.copy()
         x[DELAY_INDEX] = 0.0
-        state = State.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
+        state = FittedModel.fit_record(with_delay(delay_s), state.model, x, state.contact_spans)
     return state, delay_s
 
 
-def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
+def _candidate_with_much_smaller_residual(
+    state: FittedModel, found: list[Candidate]
+) -> Candidate | None:
     small = [x for x in found if x.name in _CAUSES_LIKE_COLOURED_NOISE]
     small = [x for x in small if _is_residual_much_smaller(x.state, state)]
     least = min([x.state.residual_ratio for x in small], default=0.0)
@@ -214,14 +220,14 @@ def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> C
     return min(near, key=lambda x: EXTENSIONS_BY_PLAUSIBILITY.index(x.name), default=None)
 
 
-def _explain_contact_by_steps(state: State, found: list[Candidate]) -> State | None:
+def _explain_contact_by_steps(state: FittedModel, found: list[Candidate]) -> FittedModel | None:
     limit = _MAX_CONTACT_RESIDUAL_SHARE * state.residual_ratio
     contacts = (x.state for x in found if x.name == "contact")
     calm = next((x for x in contacts if x.residual_ratio < limit), None)
     return None if calm is None else replace_contacts_by_steps(calm)
 
 
-def _is_misfit_reduced(candidate: Candidate, state: State) -> bool:
+def _is_misfit_reduced(candidate: Candidate, state: FittedModel) -> bool:
     fitted = candidate.state
     smaller = fitted.residual_ratio < _MAX_EFFECTIVE_MISFIT_SHARE * state.residual_ratio
     if candidate.name == "cable":
@@ -235,7 +241,7 @@ def _is_misfit_reduced(candidate: Candidate, state: State) -> bool:
     return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_CAUSE_SCORE)
 
 
-def _best_candidate(found: list[Candidate]) -> Candidate | None:
+def _most_plausible_of_best_candidates(found: list[Candidate]) -> Candidate | None:
     best = max([x.score for x in found], default=0.0)
     if best < _MIN_CAUSE_SCORE:
         return None
@@ -253,7 +259,7 @@ _MAX_ABSENT_MASS_KG, _ABSENT_MASS_OVER_DEVIATION, _PRESENT_MASS_OVER_DEVIATION =
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class MisfitExplanation:
     """Causes why a rigid load does not explain a wrench, and the load fitted with these causes.
 
     Attributes:
@@ -274,7 +280,7 @@ class Explanation:
     delay_s: float
     loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
-    state: State
+    state: FittedModel
     always_fitted: tuple[str, ...] = ()
 
     @property
@@ -290,8 +296,10 @@ class Explanation:
 
 
 def explain_misfit(
-    data: Instants, with_delay: InstantsAtDelay | None = None, always_fitted: tuple[str, ...] = ()
-) -> Explanation:
+    data: BlockMeans,
+    with_delay: BlockMeansAtDelay | None = None,
+    always_fitted: tuple[str, ...] = (),
+) -> MisfitExplanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
     The model contains the extensions `always_fitted`, such as "weight", from the start.
@@ -310,7 +318,7 @@ def explain_misfit(
         removed = None
         if "weight" in state.model.extensions:
             removed = state.x[state.model.parameter_slices["weight"]]
-        return Explanation(
+        return MisfitExplanation(
             causes=tuple(causes),
             explained=only_noise,
             theta=state.x[OFFSETS_AND_LOAD],
@@ -324,13 +332,13 @@ def explain_misfit(
         )
 
 
-def _is_load_absent(state: State, covariance: Array) -> bool:
+def _is_load_absent(state: FittedModel, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     largest = min(_MAX_ABSENT_MASS_KG, _PRESENT_MASS_OVER_DEVIATION * deviation)
     return bool(mass < max(_ABSENT_MASS_OVER_DEVIATION * deviation, largest) and deviation < 0.1)
 
 
-def _no_load_cause(state: State, covariance: Array) -> Cause:
+def _no_load_cause(state: FittedModel, covariance: Array) -> Cause:
     most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
     text = f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets"
     return Cause("no load", text, values={"mass_limit": most})

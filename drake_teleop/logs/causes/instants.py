@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from drake_teleop.common.numeric import Array, parabola_minimum
+from drake_teleop.common.numeric import Array, position_of_parabola_minimum
 
 MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
@@ -29,10 +29,10 @@ OMEGA_PRODUCTS = slice(10, 16)
 WRENCH_SIGNALS = slice(16, 22)
 WRENCH_RATE_SIGNALS = slice(22, 28)
 ROTATION_SIGNALS = slice(28, 37)
-R_P_PRODUCTS = slice(37, 64)
+ROTATION_POSITION_PRODUCTS = slice(37, 64)
 TIME_POLYNOMIALS = slice(64, 67)
 NUM_SIGNALS = 67
-MOTION_COLUMNS = np.r_[0:16, 28:37]
+COLUMNS_REPEATED_BY_STEP = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _INSTANT_RATE_HZ, _MAX_INSTANTS = 50.0, 20_000
 _BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
@@ -50,7 +50,7 @@ MotionAtTime = Callable[[Array], tuple[Array, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Instants:
+class BlockMeans:
     """Means of a record over blocks of about 20 ms.
 
     Attributes:
@@ -87,12 +87,12 @@ class Instants:
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
-    def rows_per_block(self) -> int:
+    def rows_per_search_block(self) -> int:
         """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_LENGTH_S / self.dt))
 
-    def select_rows(self, used: NDArray[np.bool_]) -> Instants:
+    def with_other_rows_zeroed(self, used: NDArray[np.bool_]) -> BlockMeans:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
@@ -100,7 +100,7 @@ class Instants:
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
-            parts.append(self.y[:, MOTION_COLUMNS] * share[:, None])
+            parts.append(self.y[:, COLUMNS_REPEATED_BY_STEP] * share[:, None])
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
@@ -126,7 +126,7 @@ def block_means_of_record(
     gravity_W: Array | None,
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
-) -> Instants:
+) -> BlockMeans:
     """Return block means of a record with N samples at even times `t` [s].
 
     The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
@@ -142,7 +142,7 @@ def block_means_of_record(
     y[:, WRENCH_SIGNALS] = wrench.reshape(rows, size, 6).mean(axis=1)
     change = y[2:, WRENCH_SIGNALS] - y[:-2, WRENCH_SIGNALS]
     y[1:-1, WRENCH_RATE_SIGNALS] = change / (2.0 * size * dt)
-    positions = _write_motion_signals(y, t, size, motion, gravity_W)
+    positions = _write_motion_signals_and_find_positions(y, t, size, motion, gravity_W)
     x = np.linspace(-1.0, 1.0, rows)
     # Legendre polynomials.
     y[:, TIME_POLYNOMIALS] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
@@ -154,14 +154,14 @@ def block_means_of_record(
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _MIN_WRENCH_NOISE_OVER_SPREAD * spread)
-    share = _smooth_noisy_alpha(y, used) if gravity_W is None else 0.0
-    out = Instants(
+    share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
+    out = BlockMeans(
         middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
     )
-    return out.select_rows(used)
+    return out.with_other_rows_zeroed(used)
 
 
-def _smooth_noisy_alpha(y: Array, used: NDArray[np.bool_]) -> float:
+def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -> float:
     from scipy.signal import savgol_filter  # a slow import for a rare case
 
     alpha = y[used][:, ALPHA_SIGNALS]
@@ -186,7 +186,7 @@ def _smallest_noise_variance_share(x: Array) -> float:
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
-def _write_motion_signals(
+def _write_motion_signals_and_find_positions(
     y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows, total = len(y), np.zeros(())
@@ -217,7 +217,7 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
     return np.hstack(parts)
 
 
-def delay_of_free_fit(data: Instants) -> float:
+def delay_of_free_fit(data: BlockMeans) -> float:
     """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
     The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
@@ -243,4 +243,6 @@ def delay_of_free_fit(data: Instants) -> float:
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):
         return 0.0
-    return float(shifts[best] + _DELAY_STEP_S * parabola_minimum(*costs[best - 1 : best + 2]))
+    return float(
+        shifts[best] + _DELAY_STEP_S * position_of_parabola_minimum(*costs[best - 1 : best + 2])
+    )

@@ -13,7 +13,7 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_other_torque_units
 from drake_teleop.logs.causes.instants import ALPHA_SIGNALS, WRENCH_SIGNALS, white_noise_deviations
 from drake_teleop.logs.causes.model import OFFSETS_AND_LOAD
-from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
+from drake_teleop.logs.causes.state import FittedModel, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
 _MAX_JACKKNIFE_OVER_FIT, _USUAL_JACKKNIFE_OVER_FIT = 1.5, 1.15
@@ -33,20 +33,20 @@ _MAX_PLAUSIBLE_GAIN_STD = 0.025
 
 
 def load_covariance(
-    state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
+    state: FittedModel, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
     out = state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = widening_factor_by_misfit(state, blocks)
     squares = np.maximum(factor * deviations, blocks) ** 2
-    squares = squares + _variances_of_rejected_causes(state, rejected)
+    squares = squares + _load_variances_by_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
     return np.asarray(out * np.outer(ratio, ratio) + gains)
 
 
 def load_deviations_if_unexplained(
-    state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
+    state: FittedModel, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
     least = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
@@ -55,11 +55,11 @@ def load_deviations_if_unexplained(
     if state.smooth_misfit > least:
         blocks = blocks * (1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
-    variance = blocks**2 + _variances_of_rejected_causes(state, lasting) + np.diag(gains)
+    variance = blocks**2 + _load_variances_by_rejected_causes(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
 
 
-def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -> Array:
+def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
@@ -73,7 +73,7 @@ def _variances_of_rejected_causes(state: State, rejected: Sequence[Candidate]) -
     return squares
 
 
-def load_covariance_by_gain_errors(state: State) -> Array:
+def load_covariance_by_gain_errors(state: FittedModel) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     rows = state.rows
     weights = rows.whitened_products(state.noise_filters) / state.noise_power[:, None, None]
@@ -109,7 +109,7 @@ def load_covariance_by_gain_errors(state: State) -> Array:
     return np.asarray(effects @ effects.T)
 
 
-def load_covariance_by_torque_unit(state: State) -> Array:
+def load_covariance_by_torque_unit(state: FittedModel) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in fits_with_other_torque_units(state):
@@ -118,7 +118,7 @@ def load_covariance_by_torque_unit(state: State) -> Array:
     return out
 
 
-def load_bias_by_alpha_noise(state: State) -> Array:
+def load_bias_by_alpha_noise(state: FittedModel) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     data = state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA_SIGNALS.start, ALPHA_SIGNALS.stop))
@@ -129,7 +129,7 @@ def load_bias_by_alpha_noise(state: State) -> Array:
     return np.asarray((state.covariance @ right)[OFFSETS_AND_LOAD])
 
 
-def widening_factor_by_misfit(state: State, blocks: Array) -> float:
+def widening_factor_by_misfit(state: FittedModel, blocks: Array) -> float:
     """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
@@ -142,7 +142,7 @@ def widening_factor_by_misfit(state: State, blocks: Array) -> float:
     return factor * (1.0 + _WIDENING_BY_MISFIT * max(0.0, state.smooth_misfit - GOOD_SMOOTH_MISFIT))
 
 
-def jackknife_load_deviations(state: State) -> Array:
+def jackknife_load_deviations(state: FittedModel) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)

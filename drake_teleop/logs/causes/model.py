@@ -14,12 +14,12 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA_SIGNALS,
+    COLUMNS_REPEATED_BY_STEP,
     CONSTANT_COLUMN,
     GRAVITY_SIGNALS,
-    MOTION_COLUMNS,
     NUM_SIGNALS,
     OMEGA_PRODUCTS,
-    R_P_PRODUCTS,
+    ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
     SPECIFIC_FORCE_SIGNALS,
     TIME_POLYNOMIALS,
@@ -104,9 +104,9 @@ class Model:
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
         wide = bool({"gravity", "cable"} & set(self.extensions))
-        kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
+        kept = np.ones(NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * len(self.steps), bool)
         if not wide:
-            kept[ROTATION_SIGNALS], kept[R_P_PRODUCTS] = False, False
+            kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
             for i in range(len(self.steps)):
                 kept[_columns_of_step(i)][_ROTATION_COLUMNS_OF_STEP] = False
         return np.flatnonzero(kept)
@@ -137,14 +137,18 @@ class Model:
 
     def wrench_coefficients(self, x: Array) -> Array:
         """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
-        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.parameter_slices
+        width, parts = (
+            NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * len(self.steps),
+            self.parameter_slices,
+        )
         motion = self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 out[..., _columns_of_step(i)] = (
-                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION_COLUMNS]
+                    _load_coefficients(x[:, parts[f"step {i}"]])
+                    @ motion[..., COLUMNS_REPEATED_BY_STEP]
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
@@ -159,10 +163,10 @@ class Model:
         out[:, 3:] *= factor[:, None, None]
         for c in self.gain_channels:
             out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
-        self._add_constant_extensions(out, x)
+        self._add_offsets_delay_and_drift(out, x)
         return out
 
-    def _add_constant_extensions(self, out: Array, x: Array) -> None:
+    def _add_offsets_delay_and_drift(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
         out[:, :, CONSTANT_COLUMN] += x[:, :6]
         out[:, channels, WRENCH_RATE_SIGNALS.start + channels] += x[:, DELAY_INDEX, None]
@@ -217,7 +221,10 @@ class Model:
 
 
 def _columns_of_step(i: int) -> slice:
-    return slice(NUM_SIGNALS + len(MOTION_COLUMNS) * i, NUM_SIGNALS + len(MOTION_COLUMNS) * (i + 1))
+    return slice(
+        NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i,
+        NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * (i + 1),
+    )
 
 
 def _load_coefficients(phi: Array) -> Array:
@@ -229,6 +236,10 @@ def _cable_coefficients(x: Array) -> Array:
     K = x[:, 3:9][:, _SYMMETRIC_MATRIX_INDICES]
     for i in range(3):
         out[:, i, ROTATION_SIGNALS.start + 3 * i : ROTATION_SIGNALS.start + 3 * i + 3] = x[:, :3]
-        out[:, i, R_P_PRODUCTS.start + 9 * i : R_P_PRODUCTS.start + 9 * i + 9] = K.reshape(-1, 9)
+        out[
+            :,
+            i,
+            ROTATION_POSITION_PRODUCTS.start + 9 * i : ROTATION_POSITION_PRODUCTS.start + 9 * i + 9,
+        ] = K.reshape(-1, 9)
     out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out

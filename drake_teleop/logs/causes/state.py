@@ -12,11 +12,11 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.instants import (
     MAX_NOISE_LAG,
     OMEGA_PRODUCTS,
-    R_P_PRODUCTS,
+    ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
     SYMMETRIC_MATRIX_ENTRIES,
     WRENCH_SIGNALS,
-    Instants,
+    BlockMeans,
 )
 from drake_teleop.logs.causes.model import Model
 
@@ -30,14 +30,16 @@ TimeSpans = tuple[tuple[float, float], ...]
 class UsedRows:
     """Rows of a record with `used` (M,) True, and the columns of its signals that a model needs."""
 
-    data: Instants
+    data: BlockMeans
     used: NDArray[np.bool_]
     times: tuple[float, ...]
     columns: NDArray[np.intp]
 
     @cached_property
     def y(self) -> Array:
-        return self.data.select_rows(self.used).append_step_signals(self.times)[:, self.columns]
+        return self.data.with_other_rows_zeroed(self.used).append_step_signals(self.times)[
+            :, self.columns
+        ]
 
     @cached_property
     def lagged_product_sums(self) -> Array:
@@ -54,7 +56,7 @@ class UsedRows:
         return np.flatnonzero(whole)
 
     @cached_property
-    def _rows_without_predecessors(self) -> Array:
+    def _lagged_signals_of_edge_rows(self) -> Array:
         padded = np.concatenate([self.used, np.zeros(MAX_NOISE_LAG, bool)])
         near = padded.copy()
         for d in range(1, MAX_NOISE_LAG + 1):
@@ -72,7 +74,7 @@ class UsedRows:
         ]
         full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(MAX_NOISE_LAG + 1, -1)
         out = full.reshape(6, width, width)
-        edge = np.tensordot(filters, self._rows_without_predecessors, axes=(1, 1))
+        edge = np.tensordot(filters, self._lagged_signals_of_edge_rows, axes=(1, 1))
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise_filters_and_power(
@@ -100,7 +102,7 @@ class UsedRows:
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def is_in_time_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
+def is_in_time_spans(data: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
@@ -109,11 +111,11 @@ def is_in_time_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
 
 _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
-_NUM_SMOOTH_SEGMENTS = 6
+_NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class FittedModel:
     """Model with parameters x (size,), fitted to rows of a record.
 
     Attributes:
@@ -135,12 +137,12 @@ class State:
 
     @classmethod
     def fit_record(
-        cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
-    ) -> State:
+        cls, data: BlockMeans, model: Model, start: Array | None = None, spans: TimeSpans = ()
+    ) -> FittedModel:
         used = data.used & ~is_in_time_spans(data, spans)
         return fit_model(model, UsedRows(data, used, model.step_times, model.columns), start, spans)
 
-    def refit(self, model: Model, start: Array | None = None, **options: int) -> State:
+    def refit(self, model: Model, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
             start = model.start_parameters(self.x, self.model)
         rows = self._rows_for_model(model)
@@ -153,7 +155,7 @@ class State:
         return UsedRows(self.data, rows.used, model.step_times, model.columns)
 
     @property
-    def data(self) -> Instants:
+    def data(self) -> BlockMeans:
         return self.rows.data
 
     def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
@@ -201,13 +203,17 @@ class State:
     def gain_by_smooth_signals(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
-        part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
+        part = np.linspace(0.0, _NUM_TIME_SEGMENTS_OF_MISFIT_TEST, len(y), endpoint=False).astype(
+            int
+        )
         parts = [y[:, : OMEGA_PRODUCTS.stop]]
         if self.data.gravity_W is not None:
             parts.append(y[:, ROTATION_SIGNALS])
         if self.data.has_positions:
-            parts.append(y[:, R_P_PRODUCTS] @ _cable_stiffness_selector().T)
-        columns = np.hstack([*parts, part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS)])
+            parts.append(y[:, ROTATION_POSITION_PRODUCTS] @ _symmetric_stiffness_signals_matrix().T)
+        columns = np.hstack(
+            [*parts, part[:, None] == np.arange(1.0, _NUM_TIME_SEGMENTS_OF_MISFIT_TEST)]
+        )
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_predecessors, self.noise_filters
         gain, freedom = 0.0, 0
@@ -235,7 +241,7 @@ def fit_model(
     spans: TimeSpans = (),
     *,
     steps: int = _MAX_FIT_ITERATIONS,
-) -> State:
+) -> FittedModel:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, WRENCH_SIGNALS] ** 2).sum(axis=0) / count
@@ -243,7 +249,7 @@ def fit_model(
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
     white = np.eye(1, MAX_NOISE_LAG + 1).repeat(6, axis=0)
     residual, power = model.residual_coefficients(x), np.maximum(both, floor)
-    found = State(model, rows, x, np.zeros(0), residual, white, power, spans)
+    found = FittedModel(model, rows, x, np.zeros(0), residual, white, power, spans)
     for step in range(steps):
         gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
@@ -253,7 +259,7 @@ def fit_model(
         residual = model.residual_coefficients(x)
         order = 0 if step + 1 < _UNWEIGHTED_FIT_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
-        found = State(model, rows, x, inverse, residual, filters, power, spans)
+        found = FittedModel(model, rows, x, inverse, residual, filters, power, spans)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED_MOVE_OVER_DEVIATION
         if still and step > _UNWEIGHTED_FIT_ITERATIONS:
             break
@@ -284,8 +290,8 @@ def score_statistic(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _cable_stiffness_selector() -> Array:
-    """Return the matrix (18, 27) from `R_P_PRODUCTS` to the signals of a symmetric stiffness."""
+def _symmetric_stiffness_signals_matrix() -> Array:
+    """Return the matrix (18, 27) from rotation-position products to signals of a stiffness."""
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(SYMMETRIC_MATRIX_ENTRIES):
         for i in range(3):

@@ -17,7 +17,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.check.corrections import (
-    MIN_CLOCK_ERROR_S,
+    MIN_LAG_OF_WRONG_CLOCK_S,
     Finding,
     call_or_none_if_unreadable,
     edit_field,
@@ -26,9 +26,9 @@ from drake_teleop.logs.check.corrections import (
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
-    DELAY_SEARCH_RANGE_S,
+    MAX_SEARCHED_DELAY_S,
     estimate_delay,
-    far_from_gaps,
+    is_far_from_gaps,
     low_pass_log,
     remove_delay,
     resample,
@@ -53,7 +53,7 @@ _MAX_FITTED_SAMPLES = 1500
 
 
 @dataclass(frozen=True)
-class LoadFit:
+class LoadFitQuality:
     """Least squares fit of a load to a log, Eq. (5).
 
     Attributes:
@@ -70,17 +70,19 @@ class LoadFit:
     @property
     def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < self.max_unexplained_share(GOOD_UNEXPLAINED)
+        return self.mass > 0 and self.unexplained < self.max_unexplained_including_noise(
+            GOOD_UNEXPLAINED
+        )
 
-    def max_unexplained_share(self, share_beside_noise: float) -> float:
+    def max_unexplained_including_noise(self, share_beside_noise: float) -> float:
         """Return the largest accepted `unexplained`: that of the noise plus the given share."""
         return min(share_beside_noise + self.noise_share, UNDETERMINED_UNEXPLAINED_SHARE)
 
 
-def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
+def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     """Fit load and offsets to the best fitting share of a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
+    smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_FITTED_SAMPLES))
     wrench = smooth.wrench[rows]
     scale = _wrench_channel_scales(wrench)
@@ -99,12 +101,14 @@ def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
     total = float(w.var(axis=0).sum()) + 1e-30
     unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFit(unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0))
+        return LoadFitQuality(
+            unexplained, float(theta[0]), independent_samples=max(1.0, len(w) - 8.0)
+        )
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise_share = passed * float(((white_noise_deviations(log.wrench) / scale) ** 2).sum()) / total
     independent_samples = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
-    return LoadFit(unexplained, float(theta[0]), noise_share, independent_samples)
+    return LoadFitQuality(unexplained, float(theta[0]), noise_share, independent_samples)
 
 
 def _fit_load_parameters(V: Array, w: Array) -> Array:
@@ -128,7 +132,7 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-def min_unexplained_reduction_by_edit(fit: LoadFit) -> float:
+def min_unexplained_reduction_by_edit(fit: LoadFitQuality) -> float:
     """Return the factor by which a correction must reduce the unexplained share of a fit."""
     n = max(1.0, fit.independent_samples)
     return max(MIN_REDUCTION_BY_EDIT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
@@ -141,16 +145,18 @@ MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_MAX_UNEXPLAINED_AFTER_CORRECTION = 0.5
+_MAX_UNEXPLAINED_AFTER_OVER_BEFORE = 0.5
 
 
-def check_wrench(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
+def check_wrench_and_estimate_delay(
+    description: Description, data: LogData
+) -> tuple[list[Finding], float | None]:
     """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
 
-    def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFit:
+    def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFitQuality:
         # A wrong description may cause a wrong delay.
         log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
         fits = [fit_load(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
@@ -158,7 +164,7 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
 
     given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
-    inside = delay is not None and abs(delay) < 0.9 * DELAY_SEARCH_RANGE_S
+    inside = delay is not None and abs(delay) < 0.9 * MAX_SEARCHED_DELAY_S
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.is_good and inside):
         edits += _clock_offset_edits(description, thin)
@@ -189,10 +195,10 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
 
 
 def _edits_with_far_better_fit(
-    fitted: Callable[[Description], LoadFit],
-    given: LoadFit,
+    fitted: Callable[[Description], LoadFitQuality],
+    given: LoadFitQuality,
     edits: list[tuple[Finding | None, Description]],
-) -> list[tuple[LoadFit, Finding | None, Description]]:
+) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
     """Return the edits with which a load of positive mass explains the wrench far better.
 
     If there are none, each edit is tried with the opposite sign of the wrench.
@@ -209,7 +215,7 @@ def _edits_with_far_better_fit(
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.max_unexplained_share(VALID_UNEXPLAINED)
+    valid = given.max_unexplained_including_noise(VALID_UNEXPLAINED)
     decisive = given.unexplained / min_unexplained_reduction_by_edit(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
@@ -245,7 +251,7 @@ def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log
 
 
 def _findings_without_remedy(
-    description: Description, log: Log, given: LoadFit, delay: float | None
+    description: Description, log: Log, given: LoadFitQuality, delay: float | None
 ) -> tuple[list[Finding], float | None]:
     smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
@@ -305,7 +311,7 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     if delay is None or abs(delay) <= MIN_REPORTED_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
-    if abs(delay) > MIN_CLOCK_ERROR_S:
+    if abs(delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         offset = description.wrench.time.offset + delay
         text = (
             f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
@@ -320,20 +326,22 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     return [Finding("lag", text)]
 
 
-def drift_finding(description: Description, data: LogData) -> tuple[list[Finding], Description]:
+def clock_drift_finding_and_correction(
+    description: Description, data: LogData
+) -> tuple[list[Finding], Description]:
     """Return a finding for a steadily growing delay, and the corrected description."""
     name = "imu" if description.pose is None else "pose"
     stream = getattr(description, name)
     if stream is None or description.wrench is None or (description.imu and description.pose):
         return [], description
     log = data.read_thinned_log(description)
-    line = _fit_delay_over_time(log)
+    line = _fit_start_delay_and_clock_drift(log)
     if line is None:
         return [], description
     late, slope = line
-    _, lines, edited = data.correct_clock_drift(name, description, late, slope)
-    limit = _MAX_UNEXPLAINED_AFTER_CORRECTION * _unexplained_without_delay(log)
-    if _unexplained_without_delay(data.read_thinned_log(edited)) > limit:
+    _, lines, edited = data.start_lag_and_clock_drift_correction(name, description, late, slope)
+    limit = _MAX_UNEXPLAINED_AFTER_OVER_BEFORE * _unexplained_after_delay_removal(log)
+    if _unexplained_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
     finding = Finding(
         "clock",
@@ -343,7 +351,7 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     return [finding], edited
 
 
-def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
+def _fit_start_delay_and_clock_drift(log: Log) -> tuple[float, float] | None:
     span = float(log.t[-1] - log.t[0])
     edges = np.linspace(0, len(log), _NUM_DELAY_PARTS + 1).astype(int)
     found = []
@@ -367,7 +375,7 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
     return float(late + slope * log.t[0]), float(slope)
 
 
-def _unexplained_without_delay(log: Log) -> float:
+def _unexplained_after_delay_removal(log: Log) -> float:
     try:
         return fit_load(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:

@@ -14,39 +14,45 @@ from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
-    LoadFit,
-    check_wrench,
-    drift_finding,
+    LoadFitQuality,
+    check_wrench_and_estimate_delay,
+    clock_drift_finding_and_correction,
     fit_load,
     undetermined_payload_finding,
     unexplained_share,
 )
 from drake_teleop.logs.check.corrections import (
-    MIN_CLOCK_ERROR_S,
+    MIN_LAG_OF_WRONG_CLOCK_S,
     MOTION_FINDINGS,
     Finding,
-    correct_gravity_unit,
+    correct_accelerometer_unit,
 )
 from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
-from drake_teleop.logs.check.log_data import LogData, channel_findings
-from drake_teleop.logs.check.pose_checks import position_findings
+from drake_teleop.logs.check.log_data import LogData, dead_or_repeated_channel_findings
+from drake_teleop.logs.check.pose_checks import position_unit_or_origin_findings
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.table_files import TABLE_READERS, read_table, yaml_only_note
+from drake_teleop.logs.read.table_files import (
+    TABLE_READERS,
+    note_that_table_needs_description,
+    read_table,
+)
 from drake_teleop.logs.read.tables import Table
 
-_MIN_ACCELERATION_AND_SPEED_RMS = 0.3, 0.1
+_MIN_MOTION_RMS_M_S2_AND_RAD_S = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _MIN_CHECKED_POSES = 6
 """Fewest poses that allow a check of the fit."""
 _MIN_GRAVITY_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_MIN_WRENCH_CHANGE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
+_MIN_WRENCH_CHANGE_OVER_LARGEST = (
+    1e-6  # smallest change of a live wrench, as a share of the largest reading
+)
 
 
 @dataclass(frozen=True)
-class Conventions:
+class ConventionCheckResult:
     """Result of the checks of a log description.
 
     Attributes:
@@ -56,24 +62,24 @@ class Conventions:
     """
 
     findings: tuple[Finding, ...]
-    fit: LoadFit
+    fit: LoadFitQuality
     mounting: Mounting | None
     delay_s: float | None
 
 
-def check_file(path: Path) -> Conventions:
+def check_conventions_of_file(path: Path) -> ConventionCheckResult:
     if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
     return check_conventions(load_description(path), str(path))
 
 
-def check_suspicious_load(
+def findings_if_load_is_suspicious(
     log: Log,
     load: Identification,
     predicted: Array,
     delay: float | None,
-    check: Callable[[], Conventions],
+    check: Callable[[], ConventionCheckResult],
 ) -> tuple[Finding, ...]:
     """Return findings, except "lag", of a log whose identified load is suspicious.
 
@@ -88,7 +94,7 @@ def check_suspicious_load(
         )
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
+    clocks = log.static or (delay is not None and abs(delay) < MIN_LAG_OF_WRONG_CLOCK_S)
     if load.mass > 0 and unexplained < GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _are_signals_suspicious(log) else ()
@@ -118,12 +124,12 @@ def check_suspicious_load(
     return tuple(found)
 
 
-def motion_findings(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
+def motion_findings(check: Callable[[], ConventionCheckResult]) -> tuple[Finding, ...]:
     """Return the findings of `check` that concern the described motion, not the wrench."""
     return tuple(x for x in _findings_except_lag(check) if x.name in MOTION_FINDINGS)
 
 
-def _findings_except_lag(check: Callable[[], Conventions]) -> list[Finding]:
+def _findings_except_lag(check: Callable[[], ConventionCheckResult]) -> list[Finding]:
     with suppress(ValueError, ArithmeticError):  # the log itself was readable
         return [finding for finding in check().findings if finding.name != "lag"]
     return []
@@ -131,7 +137,7 @@ def _findings_except_lag(check: Callable[[], Conventions]) -> list[Finding]:
 
 def _require_enough_motion(log: Log) -> None:
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _MIN_ACCELERATION_AND_SPEED_RMS[0] and omega < _MIN_ACCELERATION_AND_SPEED_RMS[1]:
+    if s < _MIN_MOTION_RMS_M_S2_AND_RAD_S[0] and omega < _MIN_MOTION_RMS_M_S2_AND_RAD_S[1]:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
@@ -154,31 +160,40 @@ def _are_signals_suspicious(log: Log) -> bool:
 
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
-) -> Conventions:
+) -> ConventionCheckResult:
     with one_blas_thread():
         found = _check_description(LogData(description, source, dict(tables or {})), description)
-    note = yaml_only_note(source)
+    note = note_that_table_needs_description(source)
     findings = tuple(replace(f, message=f"{f.message}{note}") for f in found.findings)
     return replace(found, findings=findings)
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _MIN_WRENCH_CHANGE * np.abs(log.wrench).max()).all())
+    return bool(
+        (
+            np.ptp(log.wrench, axis=0) <= _MIN_WRENCH_CHANGE_OVER_LARGEST * np.abs(log.wrench).max()
+        ).all()
+    )
 
 
-def _check_description(data: LogData, description: Description) -> Conventions:
+def _check_description(data: LogData, description: Description) -> ConventionCheckResult:
     log = data.read_whole_log(description)
     if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
-        return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
+        return ConventionCheckResult(
+            (Finding("dead channel", message),), LoadFitQuality(1.0, 0.0), None, None
+        )
     # Determine gravity once, not for each edit.
     if "gravity" in log.estimated and log.described is not None:
         description = description.model_copy(update={"gravity": log.described.gravity})
-    dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
+    dead, broken = (
+        dead_or_repeated_channel_findings(name, description, data.tables)
+        for name in ("imu", "wrench")
+    )
     if dead:  # A dead channel would cause wrong findings about motion and load.
         fit = fit_load(data.read_thinned_log(description))
-        return Conventions((*dead, *broken), fit, None, None)
-    findings, description = correct_gravity_unit(description, log)
+        return ConventionCheckResult((*dead, *broken), fit, None, None)
+    findings, description = correct_accelerometer_unit(description, log)
     more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
@@ -187,20 +202,20 @@ def _check_description(data: LogData, description: Description) -> Conventions:
         findings += more
     fit = fit_load(data.read_thinned_log(description))
     if broken or (mounting is not None and mounting.is_mirrored):
-        return Conventions((*broken, *findings), fit, mounting, None)
+        return ConventionCheckResult((*broken, *findings), fit, mounting, None)
     if "weight" in log.estimated:  # the checks below require the weight of the load in the wrench
-        return Conventions(tuple(findings), fit, mounting, None)
+        return ConventionCheckResult(tuple(findings), fit, mounting, None)
     if not findings:
-        more, description = drift_finding(description, data)
+        more, description = clock_drift_finding_and_correction(description, data)
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
-        findings += position_findings(description, data, lag)
-    more, delay = check_wrench(description, data)
+        findings += position_unit_or_origin_findings(description, data, lag)
+    more, delay = check_wrench_and_estimate_delay(description, data)
     findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
-    rest = _static_poses_finding(log)
+    rest = _too_few_or_similar_poses_finding(log)
     if rest is not None:
         findings.append(rest)
-    return Conventions(tuple(findings), fit, mounting, delay)
+    return ConventionCheckResult(tuple(findings), fit, mounting, delay)
 
 
 def _merge_clock_findings(
@@ -212,7 +227,7 @@ def _merge_clock_findings(
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.clock_drift or delay is None:
         return findings
-    if abs(mounting.lag_s + delay) > MIN_CLOCK_ERROR_S:
+    if abs(mounting.lag_s + delay) > MIN_LAG_OF_WRONG_CLOCK_S:
         return findings
     assert description.pose is not None
     finding = Finding(
@@ -223,7 +238,7 @@ def _merge_clock_findings(
     return [finding, *(other for other in findings if other.name != "clock")]
 
 
-def _static_poses_finding(log: Log) -> Finding | None:
+def _too_few_or_similar_poses_finding(log: Log) -> Finding | None:
     if not log.static:
         return None
     if len(log) < _MIN_CHECKED_POSES:

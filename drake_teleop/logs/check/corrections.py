@@ -21,7 +21,7 @@ MOTION_FINDINGS = (
     "base axes",
 )
 """Errors of the described motion, which resemble causes."""
-MIN_CLOCK_ERROR_S = 0.05
+MIN_LAG_OF_WRONG_CLOCK_S = 0.05
 """Delay above which a clock error, not the lag of a filter, is the reason [s]."""
 
 
@@ -66,7 +66,9 @@ def _lists_to_tuples(value: Any) -> Any:
     return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value
 
 
-def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Finding], Description]:
+def correct_accelerometer_unit(
+    description: Description, log: Log
+) -> tuple[list[Finding], Description]:
     """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
     sensors: dict[str, Any] = {
         f"{stream}.{name}": getattr(getattr(description, stream), name, None)
@@ -85,7 +87,7 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
     return [], description
 
 
-def pose_edits(description: Description) -> Iterator[Edit]:
+def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edit]:
     """Yield edits of a description: other forms of the orientation, opposite sign of gravity."""
     pose, imu = description.pose, description.imu
     sensed = imu is not None and imu.specific_force is not None
@@ -142,7 +144,7 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"
     yield _make_edit(description, "sign", text, {f"{stream}.sign": -sensor.sign})
-    yield from pose_edits(description)
+    yield from orientation_and_gravity_sign_edits(description)
     if isinstance(sensor.frame, str):
         text, other = "the wrench is in the axes of the base", "base"
         if sensor.frame == "base":

@@ -153,9 +153,9 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """Guess a log description from the names and magnitudes of a table's columns."""
     plain = {name: _split_name_and_unit(name) for name in table.columns}
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
-    found |= _find_numbered_columns(plain) | _find_quaternion(table, plain)
-    found |= _find_array_columns(table, plain)
-    _torque_to_position(found, plain)
+    found |= _find_vectors_in_numbered_columns(plain) | _find_quaternion(table, plain)
+    found |= _find_vectors_in_array_columns(table, plain)
+    _reinterpret_lone_torque_as_position(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_with_time(**groups: Any) -> dict[str, Any]:
@@ -235,7 +235,7 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
+def _group_numbered_columns(plain: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(pattern, words):
@@ -293,14 +293,14 @@ def _find_euler_angles(plain: _NamesAndUnits) -> _Columns:
     return {}
 
 
-def _torque_to_position(found: _Columns, plain: _NamesAndUnits) -> None:
+def _reinterpret_lone_torque_as_position(found: _Columns, plain: _NamesAndUnits) -> None:
     ends = [plain[name][0].rpartition("_")[2] for name in found.get("torque", [])]
     if ends == ["tx", "ty", "tz"] and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 
 def _find_pose_vectors(table: Table, plain: _NamesAndUnits) -> _Columns:
-    groups = _numbered_columns(plain, _POSE_VECTOR_PATTERN)
+    groups = _group_numbered_columns(plain, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
@@ -316,14 +316,14 @@ def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
 
 
 def _find_quaternion(table: Table, plain: _NamesAndUnits) -> _Columns:
-    groups = _numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
+    groups = _group_numbered_columns(plain, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
     return {"orientation": found} if found else {}
 
 
-def _find_numbered_columns(plain: _NamesAndUnits) -> _Columns:
-    groups = _numbered_columns(plain, r"\d$")
+def _find_vectors_in_numbered_columns(plain: _NamesAndUnits) -> _Columns:
+    groups = _group_numbered_columns(plain, r"\d$")
     found: _Columns = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
@@ -337,7 +337,7 @@ def _find_numbered_columns(plain: _NamesAndUnits) -> _Columns:
     return found
 
 
-def _find_array_columns(table: Table, plain: _NamesAndUnits) -> _Columns:
+def _find_vectors_in_array_columns(table: Table, plain: _NamesAndUnits) -> _Columns:
     found: _Columns = {}
     arrays = _names_of_array_columns(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import axis_names, rotation_matrices, signed_permutations
+from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices, signed_permutations
 from drake_teleop.logs.check.against_load import (
     GOOD_UNEXPLAINED,
     MIN_REDUCTION_BY_EDIT,
     VALID_UNEXPLAINED,
 )
 from drake_teleop.logs.check.corrections import (
-    MIN_CLOCK_ERROR_S,
+    MIN_LAG_OF_WRONG_CLOCK_S,
     Edit,
     Finding,
     call_or_none_if_unreadable,
     edit_field,
-    pose_edits,
+    orientation_and_gravity_sign_edits,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
@@ -27,12 +27,12 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
 RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
-MIN_REPORTED_GRAVITY_ERROR = 0.02
+MIN_REPORTED_GRAVITY_ERROR_SHARE = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
 _MIN_GRAVITY_ERROR_OVER_DEVIATION = 5.0
 _MIN_ALPHA_CORRELATION = 0.8
 _ALPHA_COMPARISON_CUTOFF_HZ = 5.0
-_MAX_UNSWAPPED_ALPHA_SHARE = 0.5
+_MAX_UNSWAPPED_OVER_BEST_CORRELATION = 0.5
 _GRAVITY_WINDOW_RANGE_S, _MIN_GRAVITY_WINDOWS, _MAX_GRAVITY_WINDOWS = (2.0, 8.0), 6, 60
 _GYRO_AXES_RATE_HZ, _MIN_WRONG_AXES_MISFIT, _MIN_AXES_MISFIT_REDUCTION = 25.0, 0.05, 3.0
 
@@ -104,7 +104,7 @@ def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tup
     if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
         return Finding(
             "swapped axes",
-            f"{text}: its x, y, z should be its {', '.join(axis_names(P))}; correct"
+            f"{text}: its x, y, z should be its {', '.join(axis_names_of_rows(P))}; correct"
             " imu.angular_velocity.columns, in the file where a sign is wrong",
         ), None
     ordered = tuple(names[k] for k in np.abs(P).argmax(axis=1))
@@ -120,17 +120,20 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if largest < _MIN_ALPHA_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_ALPHA_SHARE * largest:
+    if (
+        largest < _MIN_ALPHA_CORRELATION
+        or np.trace(alike) > _MAX_UNSWAPPED_OVER_BEST_CORRELATION * largest
+    ):
         return None
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axis_names(best))}; correct imu.angular_acceleration.columns,"
-        " or remove it",
+        f" the gyroscope's {', '.join(axis_names_of_rows(best))}; correct"
+        " imu.angular_acceleration.columns, or remove it",
     )
 
 
-def _windowed_specific_forces(log: Log, P: Array) -> Array:
+def _mean_specific_forces_in_start_axes(log: Log, P: Array) -> Array:
     """Return mean specific forces (2, n, 3) in n Hann windows, and half a window later.
 
     The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
@@ -154,7 +157,7 @@ def _windowed_specific_forces(log: Log, P: Array) -> Array:
 
 
 def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
-    means = _windowed_specific_forces(log, P) / gravity
+    means = _mean_specific_forces_in_start_axes(log, P) / gravity
     if means.shape[1] == 0:
         return np.nan
     off = np.linalg.norm(means, axis=2) - 1.0
@@ -162,14 +165,15 @@ def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
 
 
 def _gravity_magnitude_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
-    forces = _windowed_specific_forces(log, np.eye(3))[0]
+    forces = _mean_specific_forces_in_start_axes(log, np.eye(3))[0]
     if len(forces) < _MIN_GRAVITY_WINDOWS:
         return None
     ratios = np.linalg.norm(forces, axis=1) / gravity
     ratio, deviation = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     off = abs(ratio - 1.0)
     if not 0.7 < ratio < 1.4 or off < max(
-        MIN_REPORTED_GRAVITY_ERROR + 3.0 * deviation, _MIN_GRAVITY_ERROR_OVER_DEVIATION * deviation
+        MIN_REPORTED_GRAVITY_ERROR_SHARE + 3.0 * deviation,
+        _MIN_GRAVITY_ERROR_OVER_DEVIATION * deviation,
     ):
         return None
     assert imu.specific_force is not None
@@ -202,7 +206,7 @@ def check_imu_against_pose(
     if given.unexplained > GOOD_UNEXPLAINED or given.is_mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
-            for finding, edited in pose_edits(description)
+            for finding, edited in orientation_and_gravity_sign_edits(description)
             if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
         limit = min(VALID_UNEXPLAINED, given.unexplained / MIN_REDUCTION_BY_EDIT)
@@ -219,7 +223,7 @@ def check_imu_against_pose(
             description, given = best[2], best[3]
     if given.unexplained > VALID_UNEXPLAINED and not given.is_mirrored:
         return findings, given, description
-    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.clock_drift:
+    if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
@@ -259,7 +263,9 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogData)
         )
         return finding, edit_field(description, "imu.time.offset", offset)
     late = found.mid_record_lag_s - found.clock_drift * found.mid_record_time_s
-    lag, lines, edited = data.correct_clock_drift("imu", description, late, found.clock_drift)
+    lag, lines, edited = data.start_lag_and_clock_drift_correction(
+        "imu", description, late, found.clock_drift
+    )
     finding = Finding(
         "clock",
         f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"

@@ -19,7 +19,7 @@ from drake_teleop.logs.read.bags import read_stream_table
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_and_num_episodes
 from drake_teleop.logs.read.description import Description, Time
-from drake_teleop.logs.read.reading import read_description
+from drake_teleop.logs.read.reading import read_described_log
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
@@ -46,7 +46,7 @@ class LogData:
             self._add_thinned_columns(name, stream, thinned, min(steps[stream.source]))
 
     def read_whole_log(self, description: Description) -> Log:
-        return read_description(description, self._source, tables=self.tables)
+        return read_described_log(description, self._source, tables=self.tables)
 
     def read_thinned_log(self, description: Description) -> Log:
         """Return the log at about 100 Hz, as a description defines it."""
@@ -57,9 +57,9 @@ class LogData:
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
-        return read_description(description, self._source, tables=self._thinned)
+        return read_described_log(description, self._source, tables=self._thinned)
 
-    def correct_clock_drift(
+    def start_lag_and_clock_drift_correction(
         self, name: str, description: Description, late: float, drift: float
     ) -> tuple[float, str, Description]:
         """Return a stream's lag at its first row [s], lines to set, and the edited description.
@@ -95,7 +95,7 @@ class LogData:
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _table_of_stream(self, stream: Any) -> Table:
-        return self.tables[stream.source].rows_with_numbers(stream.columns)
+        return self.tables[stream.source].rows_with_any_number(stream.columns)
 
     def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
         if stream.time.column is None:
@@ -140,7 +140,7 @@ _CHECKED_FIELDS_OF_STREAM = {
 _MIN_LIVE_NOISE_OVER_SPREAD = 1e-6
 
 
-def channel_findings(
+def dead_or_repeated_channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
     """Return findings about dead and repeated channels of the stream "wrench" or "imu"."""

@@ -39,10 +39,12 @@ _WRONG_TORQUE_UNIT_RATIOS = (
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_TORQUE_UNIT_COM_TOLERANCE = 0.03
+_COM_TOLERANCE_OF_WRONG_TORQUE_UNIT = 0.03
 
 
-def position_findings(description: Description, data: LogData, lag: float) -> list[Finding]:
+def position_unit_or_origin_findings(
+    description: Description, data: LogData, lag: float
+) -> list[Finding]:
     """Return findings for positions in a wrong unit, or of a point other than So.
 
     They are compared with the accelerometer, whose clock lags the pose's by `lag` [s].
@@ -177,4 +179,4 @@ def _may_torque_unit_be_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = min(np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS)
     is_usual = _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M
-    return not is_usual or bool(off < _TORQUE_UNIT_COM_TOLERANCE * size)
+    return not is_usual or bool(off < _COM_TOLERANCE_OF_WRONG_TORQUE_UNIT * size)

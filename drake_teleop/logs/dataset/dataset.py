@@ -20,8 +20,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
     make_folder,
     output_folder,
+    replace_file_on_success,
     to_json_data,
-    whole_file,
     write_json,
     write_text,
 )
@@ -34,9 +34,9 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
 from drake_teleop.logs.dataset.dataset_files import (
+    ContactColumns,
     Dataset,
     Episode,
-    NewColumns,
     open_dataset,
     write_copy,
 )
@@ -44,15 +44,15 @@ from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, 
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
-    Hypothesis,
-    find_hypothesis,
+    WrenchHypothesis,
     find_offset_step,
-    spread_and_centre_of_calm_half,
+    find_simplest_hypothesis_and_residual,
+    ln_half_width_and_centre_of_calm_half,
 )
 from drake_teleop.logs.dataset.shared_load import (
     SharedLoad,
     find_shared_load,
-    load_of_episode,
+    fit_own_load_of_episode,
     samples_for_detector,
 )
 from drake_teleop.logs.figures import summarize_load
@@ -60,19 +60,21 @@ from drake_teleop.logs.read.alignment import resample, widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.reading import read_description
+from drake_teleop.logs.read.reading import read_described_log
 
 # Episodes that determine load, lag and noise: fewer if they are long.
 _MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
 _MAX_CALIBRATION_ROWS = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_UNEXPLAINED_LOG_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_MAX_UNEXPLAINED_LOGARITHM_OF_SPREAD = (
+    1.5  # log spread beyond the usual one that no hypothesis explains
+)
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 _WORK_FOLDER_NAME = "unfinished"
 
 
-class EpisodeTask(NamedTuple):
+class SharedJudgingData(NamedTuple):
     """Data that the verdicts of all episodes share."""
 
     dataset: Dataset
@@ -114,7 +116,7 @@ def dataset_command(
         streams = _described_or_drafted_streams(dataset, description)
         work = _open_work_folder(out, dataset, [str(load), known, streams])
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
-        task = EpisodeTask(dataset, streams, shared)
+        task = SharedJudgingData(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
         columns = [_read_judged_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
@@ -170,10 +172,10 @@ def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
     texts = Counter(json.dumps(draft, sort_keys=True) for draft in drafts)
     text, votes = texts.most_common(1)[0]
     streams = dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
-    return _choose_quaternion_order_and_sign(dataset, streams, episodes)
+    return _choose_quaternion_order_and_wrench_sign(dataset, streams, episodes)
 
 
-def _choose_quaternion_order_and_sign(
+def _choose_quaternion_order_and_wrench_sign(
     dataset: Dataset, streams: dict[str, Any], episodes: Sequence[Episode]
 ) -> dict[str, Any]:
     form = streams.get("pose", {}).get("orientation", {}).get("form", "")
@@ -185,8 +187,8 @@ def _choose_quaternion_order_and_sign(
         loads = []
         for episode in episodes:
             with suppress(DrakeTeleopError):
-                log, _ = _read_log(dataset, tried, episode)
-                loads.append(load_of_episode(EpisodeSignals(log)))
+                log, _ = _read_log_and_row_times(dataset, tried, episode)
+                loads.append(fit_own_load_of_episode(EpisodeSignals(log)))
         if loads:
             spread = float(np.median([x.spread.sum() for x in loads]))
             mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
@@ -202,7 +204,7 @@ def _choose_quaternion_order_and_sign(
 def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
     table = dataset.read_episode(episode)
     draft = draft_description(table, episode.file.parent)
-    streams = _remove_file_names(draft, dataset.fps)
+    streams = _streams_of_draft_for_all_episodes(draft, dataset.fps)
     if "FILL IN" in str(streams) or "wrench" not in streams or not {"pose", "imu"} & set(streams):
         raise DrakeTeleopError(
             "wrench, time and motion are not all recognized by the names of its columns"
@@ -220,11 +222,11 @@ def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
         if fields is None:
             break
         draft = draft.with_finding_corrected(fields)
-        streams = _remove_file_names(draft, dataset.fps)
+        streams = _streams_of_draft_for_all_episodes(draft, dataset.fps)
     return streams
 
 
-def _remove_file_names(draft: Draft, fps: float) -> dict[str, Any]:
+def _streams_of_draft_for_all_episodes(draft: Draft, fps: float) -> dict[str, Any]:
     streams = {name: dict(x) for name, x in draft.streams.items()}
     for stream in streams.values():
         stream.pop("file", None)
@@ -233,12 +235,14 @@ def _remove_file_names(draft: Draft, fps: float) -> dict[str, Any]:
     return streams
 
 
-def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
+def _read_log_and_row_times(
+    dataset: Dataset, streams: dict[str, Any], episode: Episode
+) -> tuple[Log, Array]:
     """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
     table = dataset.read_episode(episode)
     described = _description_of_episode(streams, episode, dataset.fps)
     source = f"{episode.file.name}: {episode.name}"
-    log = read_description(described, source, tables={episode.file: table}, differentiate=False)
+    log = read_described_log(described, source, tables={episode.file: table}, differentiate=False)
     if log.posed is None and log.R_WS is None:
         raise DrakeTeleopError(
             "the episode has no orientation", where=source, remedy="describe pose.orientation"
@@ -271,7 +275,7 @@ def _estimate_shared_load(
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
         try:
-            logs.append(_read_log(dataset, streams, episode)[0])
+            logs.append(_read_log_and_row_times(dataset, streams, episode)[0])
         except DrakeTeleopError as error:
             errors.append(error)
         progress(0.5 * (k + 1) * step / len(dataset.episodes))
@@ -283,7 +287,7 @@ def _estimate_shared_load(
 
 
 def _judge_all_episodes(
-    task: EpisodeTask, work: Path, jobs: int, progress: Any
+    task: SharedJudgingData, work: Path, jobs: int, progress: Any
 ) -> list[dict[str, Any]]:
     from joblib import Parallel, delayed
 
@@ -298,30 +302,32 @@ def _judge_all_episodes(
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
 
 
-def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
+def _judge_episode(task: SharedJudgingData, work: Path, number: int) -> None:
     episode = task.dataset.episodes[number]
     try:
         with one_blas_thread():
             row, columns = _verdict_on_episode(task, episode)
     except DrakeTeleopError as error:
         rows = task.dataset.read_episode(episode).rows
-        columns = NewColumns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
+        columns = ContactColumns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
-    with whole_file(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
+    with replace_file_on_success(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, np.column_stack(columns))
     write_json(work / f"{number}.json", {"episode": episode.name} | row)
 
 
-def _read_judged_columns(path: Path) -> NewColumns:
+def _read_judged_columns(path: Path) -> ContactColumns:
     values = np.load(path, allow_pickle=False)
-    return NewColumns(values[:, :6], values[:, 6] > 0.5)
+    return ContactColumns(values[:, :6], values[:, 6] > 0.5)
 
 
-def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
+def _verdict_on_episode(
+    task: SharedJudgingData, episode: Episode
+) -> tuple[dict[str, Any], ContactColumns]:
     shared = task.shared_load
-    log, at = _read_log(task.dataset, task.streams, episode)
+    log, at = _read_log_and_row_times(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
-    found, residual = find_hypothesis(
+    found, residual = find_simplest_hypothesis_and_residual(
         signals, shared.phi, shared.lag_frames, shared.usual_half_widths
     )
     faults: list[EpisodeFault] = saturation_faults(log.wrench)
@@ -335,9 +341,11 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     usual = shared.usual_half_widths
-    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0] - np.log(usual)
+    spread = ln_half_width_and_centre_of_calm_half(residual - offsets, 0.1 * usual)[0] - np.log(
+        usual
+    )
     spread -= np.log(found.force_torque_gains).repeat(3)
-    if not faults and spread.mean() > _MAX_UNEXPLAINED_LOG_SPREAD:
+    if not faults and spread.mean() > _MAX_UNEXPLAINED_LOGARITHM_OF_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
@@ -356,11 +364,11 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         "free_rms": np.sqrt(np.mean(free**2, axis=0)) if len(free) else None,
         "notes": list(log.notes),
     }
-    return row, NewColumns(rows.astype(np.float32), touched[nearest])
+    return row, ContactColumns(rows.astype(np.float32), touched[nearest])
 
 
 def _contact_wrench_and_flags(
-    shared: SharedLoad, signals: EpisodeSignals, found: Hypothesis, residual: Array
+    shared: SharedLoad, signals: EpisodeSignals, found: WrenchHypothesis, residual: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     for _ in range(3):
         contact = found.wrench_of_reading(residual)

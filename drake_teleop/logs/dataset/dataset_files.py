@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
-from drake_teleop.common.files import make_folder, whole_file, write_table, write_text
+from drake_teleop.common.files import make_folder, replace_file_on_success, write_table, write_text
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
@@ -26,7 +26,7 @@ from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import (
     array_columns,
     numeric_and_nested_columns,
-    numeric_column_names,
+    numeric_or_nested_column_names,
     read_table,
 )
 from drake_teleop.logs.read.tables import Table
@@ -47,7 +47,7 @@ class Episode(NamedTuple):
     group: str = ""
 
 
-class NewColumns(NamedTuple):
+class ContactColumns(NamedTuple):
     """New columns of an episode: contact wrench (N, 6) and flags (N,) of contact."""
 
     contact_wrench: Array
@@ -84,7 +84,7 @@ def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
     import polars as pl
 
     frame = pl.scan_parquet(file)
-    return frame.select(numeric_column_names(frame)).collect().lazy()
+    return frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
 
 
 def open_dataset(path: Path) -> Dataset:
@@ -148,7 +148,7 @@ def _open_zarr(path: Path) -> Dataset:
     return Dataset(path, "zarr", episodes, float("nan"))
 
 
-def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
+def write_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
     """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
     if dataset.kind == "hdf5":
         _write_hdf5(dataset, out, columns)
@@ -176,13 +176,13 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> No
         _write_lerobot_metadata(dataset.path / "meta", out / "meta", columns)
 
 
-def _join_columns(columns: Sequence[NewColumns]) -> NewColumns:
-    return NewColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+def _join_columns(columns: Sequence[ContactColumns]) -> ContactColumns:
+    return ContactColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
 def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
     make_folder(target.parent)
-    with whole_file(target) as temporary:
+    with replace_file_on_success(target) as temporary:
         temporary.unlink(missing_ok=True)
         try:
             if copied:
@@ -192,7 +192,7 @@ def _hard_link_or_copy(file: Path, target: Path, *, copied: bool) -> None:
             shutil.copyfile(file, temporary)
 
 
-def _write_parquet(path: Path, target: Path, new: NewColumns) -> None:
+def _write_parquet(path: Path, target: Path, new: ContactColumns) -> None:
     import polars as pl
 
     frame = pl.read_parquet(path)
@@ -217,7 +217,7 @@ def _add_features_to_metadata(text: str) -> str:
     return json.dumps(data)
 
 
-def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
+def _write_csv(path: Path, target: Path, new: ContactColumns) -> None:
     frame, first = read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
@@ -235,21 +235,21 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
         text = lines[k].rstrip(b"\r\n")
         added = separator + separator.join(value.encode() for value in values)
         lines[k] = text + added + lines[k][len(text) :]
-    with whole_file(target) as temporary:
+    with replace_file_on_success(target) as temporary:
         temporary.write_bytes(b"".join(lines))
 
 
-def _arrays_of_columns(new: NewColumns) -> list[tuple[str, NDArray]]:
+def _arrays_of_columns(new: ContactColumns) -> list[tuple[str, NDArray]]:
     return [
         ("contact_wrench", new.contact_wrench.astype(np.float32)),
         ("in_contact", new.in_contact.astype(bool)),
     ]
 
 
-def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
+def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
     h5py = import_optional_module("h5py", dataset.path)
     make_folder(out.parent)
-    with whole_file(out) as temporary:
+    with replace_file_on_success(out) as temporary:
         shutil.copyfile(dataset.path, temporary)
         with h5py.File(temporary, "r+") as file:
             for episode, new in zip(dataset.episodes, columns, strict=True):
@@ -261,7 +261,7 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> N
                     group[name] = values
 
 
-def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
+def _write_zarr(out: Path, columns: Sequence[ContactColumns]) -> None:
     zarr = import_optional_module("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
     for name, values in _arrays_of_columns(new):
@@ -270,7 +270,7 @@ def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
         zarr.consolidate_metadata(out, zarr_format=2)
 
 
-def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewColumns]) -> None:
+def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[ContactColumns]) -> None:
     info = json.loads((source / "info.json").read_text(encoding="utf-8"))
     info["features"][CONTACT_WRENCH_COLUMN] = {
         "dtype": "float32",

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.dataset.episode_verdict import Hypothesis
+from drake_teleop.logs.dataset.episode_verdict import WrenchHypothesis
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.description_fields import FORCE_UNITS, SI_VALUE_OF_UNIT, TORQUE_UNITS
 
-_UNITS_OF_QUANTITIES = (
+_SI_AND_OTHER_UNITS_OF_QUANTITIES = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
@@ -29,7 +29,9 @@ class EpisodeFault(NamedTuple):
     value: Any
 
 
-def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[EpisodeFault]:
+def name_faults(
+    x: WrenchHypothesis, usual_lag: float, known: Array, fps: float
+) -> list[EpisodeFault]:
     """Return the faults of an episode that a hypothesis contains.
 
     `usual_lag` [frames] is that of other episodes, `known` (10,) the usual load.
@@ -80,7 +82,7 @@ def _rotation_faults(M: Array, what: str) -> list[EpisodeFault]:
 
 def _unit_faults(gain: Array) -> list[EpisodeFault]:
     found = []
-    for factor, (what, si, names) in zip(gain, _UNITS_OF_QUANTITIES, strict=True):
+    for factor, (what, si, names) in zip(gain, _SI_AND_OTHER_UNITS_OF_QUANTITIES, strict=True):
         if abs(factor - 1.0) < _MIN_UNIT_FACTOR_ERROR:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, narrowest_half_interval
+from drake_teleop.common.numeric import Array, narrowest_half_width_and_centre
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSplines
@@ -39,11 +39,11 @@ _NUM_START_FIT_PARTS = 4
 _MIN_HALF_WIDTH_OVER_TYPICAL = 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
-_MAX_DEVIATION_OVER_NOISE = 1.5
+_MAX_STEP_DEVIATION_OVER_FRAME_NOISE = 1.5
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class WrenchHypothesis:
     """Explanation of an episode's wrench.
 
     Attributes:
@@ -83,19 +83,19 @@ class Hypothesis:
         return np.hstack([f / self.force_torque_gains[0], tau / self.force_torque_gains[1]])
 
 
-def hypothesis_without_fault(lag: float) -> Hypothesis:
-    return Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
+def hypothesis_without_fault(lag: float) -> WrenchHypothesis:
+    return WrenchHypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
 
 
-def spread_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
+def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
     """Return log half widths (6,), at least log `floor`, and centres of half of the residuals."""
-    widths, centres = narrowest_half_interval(residual)
+    widths, centres = narrowest_half_width_and_centre(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
 
-def find_hypothesis(
+def find_simplest_hypothesis_and_residual(
     signals: EpisodeSignals, phi: Array, usual_lag: float, typical: Array
-) -> tuple[Hypothesis, Array]:
+) -> tuple[WrenchHypothesis, Array]:
     """Return the simplest hypothesis that explains the wrench of an episode, and its residual.
 
     The residual (N, 6) is the reading without the wrench of load phi (10,); offsets remain.
@@ -125,35 +125,37 @@ class HypothesisSearch:
     """Search for the best hypothesis of an episode; `floor` (6,) is the least half width."""
 
     def __init__(self, signals: EpisodeSignals, phi: Array, usual_lag: float, floor: Array) -> None:
-        self.predict = lru_cache(maxsize=None)(partial(signals.predict_reading, phi))
+        self.predict = lru_cache(maxsize=None)(partial(signals.measured_and_load_wrench, phi))
         self.regress = signals.regressor_at_lag
         self.usual_lag, self.floor, self.frames = usual_lag, floor, len(signals.log)
         self.price = _SPREAD_COST_PER_FAULT + _SPREAD_COST_TIMES_FRAMES / self.frames
 
-    def unexplained_reading(self, x: Hypothesis) -> Array:
+    def unexplained_reading(self, x: WrenchHypothesis) -> Array:
         """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
         wrench, load_wrench = self.predict(x.kind, x.lag)
         if x.phi is not None:
             return np.asarray(wrench - self.regress(x.lag) @ x.phi)
         return wrench - x.reading_of_load(load_wrench)
 
-    def with_spread_and_cost(self, x: Hypothesis) -> Hypothesis:
-        spread, offsets = spread_and_centre_of_calm_half(self.unexplained_reading(x), self.floor)
+    def with_spread_and_cost(self, x: WrenchHypothesis) -> WrenchHypothesis:
+        spread, offsets = ln_half_width_and_centre_of_calm_half(
+            self.unexplained_reading(x), self.floor
+        )
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
-    def _best_rows_of(self, x: Hypothesis) -> NDArray[np.bool_]:
+    def _best_rows_of(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
         return _rows_of_smallest_residual(
             (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
         )
 
-    def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
+    def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
         force, torque = (
             self.best_permutation(*both, channels)
             for channels in (_FORCE_CHANNELS, _TORQUE_CHANNELS)
         )
-        plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
+        plain = WrenchHypothesis(kind, lag, np.eye(3), np.eye(3), one)
         yield self.with_spread_and_cost(plain)
         yield self.with_spread_and_cost(
             replace(plain, force_axes=-np.eye(3), torque_axes=-np.eye(3))
@@ -177,31 +179,35 @@ class HypothesisSearch:
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
-        spread = spread_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0].reshape(3, 3, 2)
+        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0].reshape(
+            3, 3, 2
+        )
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
             for M in _SIGNED_PERMUTATIONS
         ]
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
-    def start_rows(self) -> Iterator[NDArray[np.bool_]]:
+    def row_flags_for_first_fits(self) -> Iterator[NDArray[np.bool_]]:
         """Yield flags (N,) of frames for a first fit: all, then each quarter of the episode."""
         at = np.arange(self.frames) * _NUM_START_FIT_PARTS // self.frames
         yield at >= 0
         for part in range(_NUM_START_FIT_PARTS):
             yield at == part
 
-    def refit_to_best_rows(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
+    def refit_to_best_rows(
+        self, x: WrenchHypothesis, *, det: float, scale: bool
+    ) -> WrenchHypothesis:
         """Return the hypothesis with rotation and factors fitted to the best rows.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
-        found = [self._fit_to_rows(x, rows, det, scale) for rows in self.start_rows()]
+        found = [self._fit_to_rows(x, rows, det, scale) for rows in self.row_flags_for_first_fits()]
         return min(found, key=lambda x: x.cost)
 
     def _fit_to_rows(
-        self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
-    ) -> Hypothesis:
+        self, x: WrenchHypothesis, rows: NDArray[np.bool_], det: float, scale: bool
+    ) -> WrenchHypothesis:
         both = self.predict(x.kind, x.lag)
         for _ in range(_NUM_REFITS):
             w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
@@ -220,17 +226,19 @@ class HypothesisSearch:
             rows = self._best_rows_of(x)
         return x
 
-    def hypothesis_of_other_load(self, lag: float) -> Hypothesis:
+    def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
         """Return the hypothesis of another load, fitted to the best rows."""
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        found = [self._fit_other_load(wrench, V, lag, rows) for rows in self.start_rows()]
+        found = [
+            self._fit_other_load(wrench, V, lag, rows) for rows in self.row_flags_for_first_fits()
+        ]
         return min(found, key=lambda x: x.cost)
 
     def _fit_other_load(
         self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
-    ) -> Hypothesis:
+    ) -> WrenchHypothesis:
         x = hypothesis_without_fault(lag)
-        weights = np.exp(-spread_and_centre_of_calm_half(wrench, self.floor)[0])
+        weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
         for _ in range(_NUM_REFITS):
             w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
             A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
@@ -240,7 +248,7 @@ class HypothesisSearch:
             rows, weights = self._best_rows_of(x), np.exp(-x.spread)
         return x
 
-    def best_lag(self, x: Hypothesis) -> float:
+    def best_lag(self, x: WrenchHypothesis) -> float:
         """Return the lag [frames] with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
@@ -285,7 +293,7 @@ def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     return np.asarray(U @ np.diag([1.0, 1.0, det * np.sign(np.linalg.det(U @ Vt))]) @ Vt)
 
 
-def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
+def _fit_gains(w: Array, p: Array, x: WrenchHypothesis) -> Array:
     gains = []
     for channels, M in ((_FORCE_CHANNELS, x.force_axes), (_TORQUE_CHANNELS, x.torque_axes)):
         q = p[:, channels] @ M.T
@@ -293,7 +301,7 @@ def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     return np.maximum(gains, 1e-9)
 
 
-def _weighted_number_of_faults(x: Hypothesis, usual_lag: float) -> float:
+def _weighted_number_of_faults(x: WrenchHypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
@@ -317,11 +325,13 @@ def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array]
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL)
-    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_DEVIATION_OVER_NOISE * noise)
+    deviation = np.minimum(
+        np.exp(spread) / HALF_WIDTH_OF_NORMAL, _MAX_STEP_DEVIATION_OVER_FRAME_NOISE * noise
+    )
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
-        centre = spread_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
+        centre = ln_half_width_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
         return (np.abs(part - centre) <= _MAX_INLIER_DEVIATIONS * deviation).all(axis=1), centre
 
     whole = inliers_and_centre(residual)[0].sum()
@@ -396,7 +406,7 @@ class EpisodeSignals:
     def regressor_at_lag(self, lag: float) -> Array:
         return regressor(*self.motion_at_lag(lag)[:3])
 
-    def predict_reading(self, phi: Array, kind: str, lag: float) -> tuple[Array, Array]:
+    def measured_and_load_wrench(self, phi: Array, kind: str, lag: float) -> tuple[Array, Array]:
         """Return the measured wrench (N, 6) in the axes of S, and that of load phi (10,).
 
         `kind` is one of `HYPOTHESIS_KINDS`, `lag` the delay of the motion [frames].

@@ -11,18 +11,25 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.contact.detection import MAX_NOISE_LEVEL, fit_noise_floor
-from drake_teleop.load.contact.noise_floor import DetectorSamples, NoiseFloor, limit_covariance
+from drake_teleop.load.contact.detection import (
+    NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
+    fit_noise_floor,
+)
+from drake_teleop.load.contact.noise_floor import (
+    DetectorSamples,
+    NoiseFloor,
+    limit_covariance_to_scales,
+)
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     LAG_STEPS_PER_FRAME,
     EpisodeSignals,
-    Hypothesis,
     HypothesisSearch,
+    WrenchHypothesis,
     hypothesis_without_fault,
 )
-from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 
@@ -59,7 +66,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     Episodes with another load or wrong axes, and contact, have no influence if they are few.
     """
     episodes = [EpisodeSignals(log) for log in logs]
-    own = [load_of_episode(signals) for signals in episodes]
+    own = [fit_own_load_of_episode(signals) for signals in episodes]
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
@@ -68,22 +75,22 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
         def counted_excess(phi: Array) -> float:
-            excess = _excess_log_spread(episodes, own, phi)
+            excess = _excess_spread_over_own_loads(episodes, own, phi)
             return float(excess.clip(max=_MAX_COUNTED_EXCESS_SPREAD).sum())
 
         phi = min(candidates, key=counted_excess)
         for _ in range(2):
-            members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
+            members = _excess_spread_over_own_loads(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
             members = members if members.any() else np.ones(len(own), bool)
             load = _fit_load_to_members(episodes, own, members, phi)
             phi = load.phi
     assert load is not None
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
-    phi = load.phi if determined else usable_phi(load)[0]
-    members = _excess_log_spread(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
+    phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
+    members = _excess_spread_over_own_loads(episodes, own, phi) < _MAX_MEMBER_EXCESS_SPREAD
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
-    usual = [_hypothesis_and_residual(episodes[k], phi, own[k].lag) for k in chosen]
+    usual = [_faultless_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
     steps = float(np.median([x.lag for x, _ in usual])) * LAG_STEPS_PER_FRAME
     lag = round(steps) / LAG_STEPS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
@@ -92,12 +99,17 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         for k, (x, residual) in zip(chosen, usual, strict=True)
     ]
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
-    floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
-    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.free_maxima[0]))
+    floor = fit_noise_floor(
+        *pooled, limit_covariance_to_scales(phi, load.covariance, tared=True), fade=0.0
+    )
+    threshold = max(
+        NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
+        _THRESHOLD_OVER_LARGEST_LEVEL * float(floor.free_maxima[0]),
+    )
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 
-def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
+def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
     """Return the load that explains an episode best, and its lag."""
     search = HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
@@ -105,17 +117,17 @@ def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
     return min(found, key=lambda x: x.spread.sum())
 
 
-def _excess_log_spread(
-    episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
+def _excess_spread_over_own_loads(
+    episodes: Sequence[EpisodeSignals], own: Sequence[WrenchHypothesis], phi: Array
 ) -> Array:
     pairs = zip(episodes, own, strict=True)
-    usual = [_hypothesis_and_residual(s, phi, x.lag)[0].spread.sum() for s, x in pairs]
+    usual = [_faultless_hypothesis_at_best_lag(s, phi, x.lag)[0].spread.sum() for s, x in pairs]
     return np.array(usual) - [x.spread.sum() for x in own]
 
 
-def _hypothesis_and_residual(
+def _faultless_hypothesis_at_best_lag(
     signals: EpisodeSignals, phi: Array, near: float
-) -> tuple[Hypothesis, Array]:
+) -> tuple[WrenchHypothesis, Array]:
     """Return the hypothesis without fault at the best lag near one [frames], and its residual."""
     search = HypothesisSearch(signals, phi, near, _MIN_RESIDUAL_HALF_WIDTH)
     lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
@@ -126,14 +138,14 @@ def _hypothesis_and_residual(
 
 def _fit_load_to_members(
     episodes: Sequence[EpisodeSignals],
-    own: Sequence[Hypothesis],
+    own: Sequence[WrenchHypothesis],
     members: NDArray[np.bool_],
     phi: Array,
 ) -> Identification:
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
     for k in (int(row) for row in np.flatnonzero(members)):
-        x, r = _hypothesis_and_residual(episodes[k], phi, own[k].lag)
+        x, r = _faultless_hypothesis_at_best_lag(episodes[k], phi, own[k].lag)
         sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episodes[k].regressor_at_lag(x.lag)[rows], episodes[k].log.wrench[rows]

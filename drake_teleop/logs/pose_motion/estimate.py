@@ -16,14 +16,14 @@ from drake_teleop.logs.pose_motion.linear_model import (
     DELAY_SEARCH_HALF_RANGE_S,
     FitWindow,
     Spectra,
-    choose_knot_spacing,
+    choose_knot_spacing_and_delay,
     correct_clock_rate,
     delay_std,
     estimate_clock_rate_error,
     fit_linear_model,
     fit_noise_levels,
-    guess_knot_spacing,
-    splines_of_averaged_poses,
+    guess_knot_spacing_and_delay,
+    spline_cache_of_averaged_poses,
 )
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
@@ -255,8 +255,8 @@ def _find_splines_and_delay(
     rows = _part_with_most_varied_force(grid)
     part = whole.select_rows(rows)
     near_poses = _select_poses_near_grid(poses, part.grid)
-    cache = splines_of_averaged_poses(near_poses)
-    spacing, late = guess_knot_spacing(part, cache, guess, known=known)
+    cache = spline_cache_of_averaged_poses(near_poses)
+    spacing, late = guess_knot_spacing_and_delay(part, cache, guess, known=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
     part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
@@ -264,13 +264,13 @@ def _find_splines_and_delay(
     if rate:
         near_poses = correct_clock_rate(near_poses, rate, part.grid, late)
         poses = correct_clock_rate(poses, rate, part.grid, late)
-        cache = splines_of_averaged_poses(near_poses)
+        cache = spline_cache_of_averaged_poses(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
         imu_rows = correct_imu_data(PoseSplines(near_poses, imu_spacing), imu, gravity)
         agrees = imu_rows is not None
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
-    chosen, spacing, late = choose_knot_spacing(part, choices, late, known=known)
+    chosen, spacing, late = choose_knot_spacing_and_delay(part, choices, late, known=known)
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
         imu_rows = correct_imu_data(PoseSplines(poses, imu_spacing), imu, gravity)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drake_teleop.common.numeric import Array, parabola_minimum
+from drake_teleop.common.numeric import Array, position_of_parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     WRENCH_COLUMNS,
@@ -41,7 +41,7 @@ MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-7
 """Least noise of a channel relative to the wrench, for rounded numbers."""
 _COARSE_DELAY_STEP_S, _FINE_DELAY_STEP_S, _FINEST_DELAY_STEP_S = 0.016, 1e-3, 1e-5
 _REWEIGHTING_ITERATIONS = 4
-_MIN_POSES_PER_S = 125.0
+_MIN_AVERAGED_POSE_RATE_HZ = 125.0
 _MIN_RELATIVE_GRAM_EIGENVALUE, _MIN_RELATIVE_PIVOT_FOR_INVERSE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _TRIED_OFFSET_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
@@ -85,7 +85,7 @@ def _moments_of_signals_and_wrench(Z: Array) -> tuple[Array, Array, Array]:
 def _fit_to_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    floor = _min_noise_power_of_wrench(ff, levels.band_sizes)
+    floor = _min_noise_power_of_wrench(ff, levels.half_dof_of_bands)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -95,7 +95,7 @@ def _fit_to_moments(
     scale = np.where(size > 1e-18 * constant, 1.0 / np.sqrt(size + 1e-300), 0.0)
     both = scale[..., :, None] * scale[..., None, :]
     zz, zf = zz * both[..., None, :, :], zf * scale[..., None, :, None]
-    power = np.maximum(ff / levels.band_sizes[:, None], floor).mean(axis=-2, keepdims=True)
+    power = np.maximum(ff / levels.half_dof_of_bands[:, None], floor).mean(axis=-2, keepdims=True)
     power = np.broadcast_to(power, (*zf.shape[:-2], 6))
     flat = zz.reshape(*zz.shape[:-2], -1)
     for _ in range(_REWEIGHTING_ITERATIONS):
@@ -129,13 +129,13 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
     return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
-def min_noise_power(Z: Array, band_sizes: Array) -> Array:
+def min_noise_power(Z: Array, half_dof_of_bands: Array) -> Array:
     """Return the least noise power (6,) of the wrench, by rounding; Z: `Spectra.second_moments`."""
-    return _min_noise_power_of_wrench(_moments_of_signals_and_wrench(Z)[2], band_sizes)
+    return _min_noise_power_of_wrench(_moments_of_signals_and_wrench(Z)[2], half_dof_of_bands)
 
 
-def _min_noise_power_of_wrench(ff: Array, band_sizes: Array) -> Array:
-    power = ff.sum(axis=0) / band_sizes.sum()
+def _min_noise_power_of_wrench(ff: Array, half_dof_of_bands: Array) -> Array:
+    power = ff.sum(axis=0) / half_dof_of_bands.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
@@ -272,7 +272,7 @@ class FitWindow:
         return Spectra(bands, wrench, signals, delay, self.grid, self.taper, zeta)
 
 
-def find_best_delay(
+def find_best_delay_and_cost(
     spectra: Spectra, reach: float, finest: float = _FINEST_DELAY_STEP_S
 ) -> tuple[float, float]:
     """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
@@ -281,7 +281,7 @@ def find_best_delay(
     costs = spectra.costs_at_delays(at)
     while step > finest:
         best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
-        centre = float(at[best] + step * parabola_minimum(*costs[best - 1 : best + 2]))
+        centre = float(at[best] + step * position_of_parabola_minimum(*costs[best - 1 : best + 2]))
         step /= 8.0
         at = centre + step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
         costs = spectra.costs_at_delays(at)
@@ -301,7 +301,7 @@ def delay_std(spectra: Spectra) -> float:
     return float(_FINE_DELAY_STEP_S / np.sqrt(bend))
 
 
-def guess_knot_spacing(
+def guess_knot_spacing_and_delay(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
     """Return knot distance [s] and delay [s] of highest likelihood on a coarse grid.
@@ -315,12 +315,14 @@ def guess_knot_spacing(
         if known:
             found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = find_best_delay(spectra, spectra.delay_search_half_range_s, _FINE_DELAY_STEP_S)
+        late, cost = find_best_delay_and_cost(
+            spectra, spectra.delay_search_half_range_s, _FINE_DELAY_STEP_S
+        )
         found.append((cost, h, late))
     return min(found)[1:]
 
 
-def choose_knot_spacing(
+def choose_knot_spacing_and_delay(
     window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
     """Return splines, knot distance [s] and delay [s] of about the highest likelihood.
@@ -348,13 +350,15 @@ def choose_knot_spacing(
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
         last = start.with_motion(cache.splines_with_spacing(best), window.gravity_W, delay)
-        delay, _ = find_best_delay(last, 3 * _COARSE_DELAY_STEP_S)
+        delay, _ = find_best_delay_and_cost(last, 3 * _COARSE_DELAY_STEP_S)
     return cache, best, delay
 
 
-def splines_of_averaged_poses(poses: Poses) -> SplineCache:
+def spline_cache_of_averaged_poses(poses: Poses) -> SplineCache:
     """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _MIN_POSES_PER_S + 1e-6))))
+    return SplineCache(
+        poses.average_consecutive(max(1, int(poses.rate / _MIN_AVERAGED_POSE_RATE_HZ + 1e-6)))
+    )
 
 
 def _knot_spacings_for_pose_rate(cache: SplineCache) -> list[float]:
@@ -375,7 +379,7 @@ def estimate_clock_rate_error(
     now, best = first, 0.0
     least = start = now.fit_coefficients().cost
     for _ in range(_MAX_CLOCK_RATE_ITERATIONS):
-        step, gain = _clock_rate_and_delay_step(now)
+        step, gain = _clock_rate_step_and_likelihood_gain(now)
         trial = best + step
         if gain < _MIN_CLOCK_RATE_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
@@ -396,7 +400,7 @@ def correct_clock_rate(poses: Poses, rate: float, grid: WrenchGrid, delay: float
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 
 
-def _clock_rate_and_delay_step(spectra: Spectra) -> tuple[float, float]:
+def _clock_rate_step_and_likelihood_gain(spectra: Spectra) -> tuple[float, float]:
     fit, grid = spectra.fit_coefficients(), spectra.grid
     change = np.gradient(spectra.motion_signals, grid.dt, axis=0)
     from_middle = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]

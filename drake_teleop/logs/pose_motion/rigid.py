@@ -150,11 +150,11 @@ def fit_rigid(
     Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
     `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
     """
-    record = _FitData(Z, Q, levels, free, linear.noise_power)
+    record = _RigidFitData(Z, Q, levels, free, linear.noise_power)
     solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve_rigid_fit(replace(record, noise_moments=np.zeros_like(Q)), solution.parameters)
-    least = min_noise_power(record.moments, levels.band_sizes)
+    least = min_noise_power(record.moments, levels.half_dof_of_bands)
     power = np.maximum(
         levels.noise_power(_residual_channel_powers(record, plain.parameters)), least
     )
@@ -173,7 +173,7 @@ def fit_rigid(
 
 
 @dataclass(frozen=True, eq=False)
-class _FitData:
+class _RigidFitData:
     moments: Array
     noise_moments: Array
     noise_levels: NoiseLevels
@@ -192,9 +192,9 @@ class _RigidSolution:
 
 
 def _solve_rigid_fit(
-    record: _FitData, state: RigidParameters, *, one_weight: bool = False
+    record: _RigidFitData, state: RigidParameters, *, one_weight: bool = False
 ) -> _RigidSolution:
-    sizes, clean = record.noise_levels.band_sizes, record.moments - record.noise_moments
+    sizes, clean = record.noise_levels.half_dof_of_bands, record.moments - record.noise_moments
     R = _residual_covariances(record, state, record.linear_noise_power * sizes[:, None])
     for _ in range(_MAX_RIGID_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
@@ -215,7 +215,7 @@ def _solve_rigid_fit(
 
 
 def _parameter_covariance(
-    record: _FitData, solution: _RigidSolution, inflation: float, gain_std: float
+    record: _RigidFitData, solution: _RigidSolution, inflation: float, gain_std: float
 ) -> Array:
     inverse, undetermined = solution.inverse_gram, solution.is_undetermined
     W, none = solution.residual_weights, np.zeros((6, NUM_MOMENT_SIGNALS))
@@ -234,7 +234,7 @@ def _parameter_covariance(
     return mark_undetermined(larger, undetermined)
 
 
-def _std_factors_of_estimated_weights(record: _FitData, solution: _RigidSolution) -> Array:
+def _std_factors_of_estimated_weights(record: _RigidFitData, solution: _RigidSolution) -> Array:
     levels, B = record.noise_levels, solution.residual_derivative
     half = np.einsum("cjk,ji->cik", B, solution.inverse_gram)
     weight = np.diagonal(solution.residual_weights, axis1=1, axis2=2)
@@ -243,7 +243,7 @@ def _std_factors_of_estimated_weights(record: _FitData, solution: _RigidSolution
     )
     part = levels.sums_over_groups(part).reshape(-1, NUM_RIGID_PARAMETERS)
     share = part / np.maximum(part.sum(axis=0), 1e-300)
-    freedom = np.repeat(2.0 * levels.sums_over_groups(levels.band_sizes), 6)
+    freedom = np.repeat(2.0 * levels.sums_over_groups(levels.half_dof_of_bands), 6)
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
@@ -267,7 +267,9 @@ def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
         ahead, behind = (
-            _motion_map_with_delay(replace(state, R_PS=_rotate_by_vector(state.R_PS, x * unit)))
+            _motion_map_with_delay(
+                replace(state, R_PS=_rotate_about_own_axes(state.R_PS, x * unit))
+            )
             for x in (_ROTATION_DIFFERENCE_STEP_RAD, -_ROTATION_DIFFERENCE_STEP_RAD)
         )
         B[:, 17 + i] = -L @ lever
@@ -301,19 +303,19 @@ def _residual_cross_powers(Z: Array, state: RigidParameters) -> Array:
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _residual_channel_powers(record: _FitData, state: RigidParameters) -> Array:
+def _residual_channel_powers(record: _RigidFitData, state: RigidParameters) -> Array:
     return np.asarray(np.diagonal(_residual_cross_powers(record.moments, state), axis1=1, axis2=2))
 
 
 def _residual_covariances(
-    record: _FitData, state: RigidParameters, sums: Array, used: Array | None = None
+    record: _RigidFitData, state: RigidParameters, sums: Array, used: Array | None = None
 ) -> Array:
-    levels, sizes = record.noise_levels, record.noise_levels.band_sizes[:, None]
+    levels, sizes = record.noise_levels, record.noise_levels.half_dof_of_bands[:, None]
     P = _residual_cross_powers(record.noise_moments, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
         _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(sums, used),
-        min_noise_power(record.moments, levels.band_sizes),
+        min_noise_power(record.moments, levels.half_dof_of_bands),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
@@ -332,7 +334,9 @@ def _parameter_errors_of_unit_gains(solution: _RigidSolution, Z: Array) -> Array
     return parameter_errors_by_gains(BF, solution.residual_weights, solution.inverse_gram)
 
 
-def _expected_misfit_by_gains(record: _FitData, solution: _RigidSolution, gain_std: float) -> float:
+def _expected_misfit_by_gains(
+    record: _RigidFitData, solution: _RigidSolution, gain_std: float
+) -> float:
     if gain_std == 0.0:
         return 0.0
     B, levels = solution.residual_derivative, record.noise_levels
@@ -353,11 +357,13 @@ def _add_rigid_step(state: RigidParameters, step: Array) -> RigidParameters:
         state.theta + step[OFFSET_AND_LOAD_PARAMETERS],
         state.delay_s + float(step[16]),
         state.p_PoSo_P + step[LEVER_PARAMETERS],
-        Rotation.from_matrix(_rotate_by_vector(state.R_PS, step[ROTATION_PARAMETERS])).as_matrix(),
+        Rotation.from_matrix(
+            _rotate_about_own_axes(state.R_PS, step[ROTATION_PARAMETERS])
+        ).as_matrix(),
     )
 
 
-def _rotate_by_vector(R: Array, rho: Array) -> Array:
+def _rotate_about_own_axes(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())
 
 

@@ -92,7 +92,7 @@ class FrequencyBands:
         return int(self.band_of_frequency[-1]) + 1
 
     @cached_property
-    def band_sizes(self) -> Array:
+    def half_dof_of_bands(self) -> Array:
         """Half the number of independent values (num_bands,) in each band."""
         return np.asarray(np.bincount(self.band_of_frequency, self.frequency_weight), np.float64)
 
@@ -215,26 +215,26 @@ class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
-        band_sizes: (bands,) half the number of independent values in each band.
+        half_dof_of_bands: (bands,) half the number of independent values in each band.
         group_of_band: (bands,) group of each band.
         relative_power: (bands, 6) power relative to the level.
     """
 
-    band_sizes: Array
+    half_dof_of_bands: Array
     group_of_band: NDArray[np.intp]
     relative_power: Array
 
     @classmethod
     def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
         """Return levels of noise that is white within each group of bands."""
-        return cls(bands.band_sizes, bands.group_of_band, np.ones((bands.num_bands, 6)))
+        return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """
-        remaining = self.sums_over_groups(self.band_sizes)[:, None]
+        remaining = self.sums_over_groups(self.half_dof_of_bands)[:, None]
         if used is not None:
             left = remaining - 0.5 * self.sums_over_groups(used)
             remaining = np.maximum(left, _MIN_REMAINING_DOF_SHARE * remaining)
@@ -251,13 +251,13 @@ class NoiseLevels:
 
     def negative_log_likelihoods(self, power: Array) -> Array:
         """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""
-        return np.asarray(self.band_sizes @ np.log(power))
+        return np.asarray(self.half_dof_of_bands @ np.log(power))
 
 
 def random_walk_relative_power(bands: FrequencyBands, corner: float) -> Array:
     """Return the mean (bands,) of 1 + (corner / f)^2 in each band, Eq. (T74)."""
     f = np.maximum(bands.frequency, bands.frequency[1])
-    return np.asarray(1.0 + bands.sums_over_bands((corner / f) ** 2) / bands.band_sizes)
+    return np.asarray(1.0 + bands.sums_over_bands((corner / f) ** 2) / bands.half_dof_of_bands)
 
 
 OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])

@@ -208,7 +208,7 @@ class PoseSplines:
 
         They are [1, acceleration, -gravity, alpha, products of omega].
         """
-        a, minus_g, omega, alpha = self._motion_in_blocks(t, gravity_W)
+        a, minus_g, omega, alpha = self._motion_and_gravity_in_blocks(t, gravity_W)
         zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
         zeta[:, 0] = 1.0
         zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
@@ -219,7 +219,7 @@ class PoseSplines:
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
         """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
-        a, minus_g, omega, alpha = self._motion_in_blocks(t, gravity_W)
+        a, minus_g, omega, alpha = self._motion_and_gravity_in_blocks(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
@@ -231,13 +231,17 @@ class PoseSplines:
             out[part] = _rotate_W_to_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
         return out
 
-    def _motion_in_blocks(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+    def _motion_and_gravity_in_blocks(
+        self, t: Array, gravity_W: Array
+    ) -> tuple[Array, Array, Array, Array]:
         out = np.empty((4, len(t), 3))
         for part in _split_rows_into_blocks(len(t)):
-            out[:, part] = self._motion_at(t[part], gravity_W)
+            out[:, part] = self._motion_and_gravity_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 
-    def _motion_at(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+    def _motion_and_gravity_at(
+        self, t: Array, gravity_W: Array
+    ) -> tuple[Array, Array, Array, Array]:
         x, first, second = (self._evaluate_derivative(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)

@@ -186,7 +186,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
     return log.select_rows(known).with_motion(*motion, **advanced)
 
 
-def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
@@ -214,7 +214,7 @@ def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]
 
 
-DELAY_SEARCH_RANGE_S = 0.25
+MAX_SEARCHED_DELAY_S = 0.25
 _MAX_SAMPLES_FOR_DELAY = 5000
 _MIN_SAMPLES_FOR_DELAY = 32
 
@@ -227,10 +227,10 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff)
-    reach = min(DELAY_SEARCH_RANGE_S, 0.1 * float(log.t[-1] - log.t[0]))
+    reach = min(MAX_SEARCHED_DELAY_S, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    gap = ~far_from_gaps(log, cutoff)
+    gap = ~is_far_from_gaps(log, cutoff)
     gap = widen_flags(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_SAMPLES_FOR_DELAY:

@@ -104,7 +104,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     if version == 2:
         for name, value in read_hdf5(path, transpose=True).items():
             if not name.startswith("#refs#"):
-                _add_array(name, value, found)
+                _add_mat_array_unless_scalar(name, value, found)
     elif version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
@@ -113,7 +113,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     else:
         for name, value in loadmat(path).items():
             if isinstance(value, np.ndarray):
-                _add_array(name, value, found)
+                _add_mat_array_unless_scalar(name, value, found)
     if not found:
         raise ValueError("it has no arrays of numbers; save tables and timeseries as arrays")
     return found
@@ -151,7 +151,9 @@ def _add_mat_variable(
     if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _MAT_COMPLEX_FLAG:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
-        _add_array(name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found)
+        _add_mat_array_unless_scalar(
+            name, _parse_mat_numbers(parts[3], order).reshape(size, order="F"), found
+        )
     elif flags & 0xFF == _MAT_STRUCTURE_CLASS and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _parse_mat_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
@@ -169,7 +171,7 @@ def _parse_mat_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     )
 
 
-def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
+def _add_mat_array_unless_scalar(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
     if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.cause import direction_std_deg
 from drake_teleop.logs.causes.explain import explain_misfit
-from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
+from drake_teleop.logs.causes.instants import BlockMeans, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
@@ -187,7 +187,7 @@ def _pose_frame_note(name: str, value: Any, deviation: str) -> str:
     )
 
 
-def block_means_of_log(log: Log) -> Instants:
+def block_means_of_log(log: Log) -> BlockMeans:
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
@@ -221,7 +221,7 @@ def estimate_auto_gravity(
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
 
-    def instants_at_delay(delay_s: float) -> Instants:
+    def instants_at_delay(delay_s: float) -> BlockMeans:
         return block_means_of_log(remove_delay(log, delay_s))
 
     explanation = explain_misfit(block_means_of_log(log), instants_at_delay, ("gravity",))

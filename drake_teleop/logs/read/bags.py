@@ -98,7 +98,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     columns = _join_blocks(blocks)
     received = columns.pop(_RECEPTION_TIME_COLUMN)
     absent = _remove_fields_marked_absent(columns)
-    columns |= _short_column_names(columns)
+    columns |= _columns_by_short_name(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
@@ -278,7 +278,7 @@ def _remove_fields_marked_absent(columns: dict[str, NDArray]) -> tuple[str, ...]
     return absent
 
 
-def _short_column_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+def _columns_by_short_name(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]

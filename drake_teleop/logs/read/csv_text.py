@@ -24,7 +24,7 @@ _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
-_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_DECIMAL_COMMA_CELL_PATTERN = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
@@ -37,7 +37,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     if head.startswith(_UTF_16_MARKS):
         source = path.read_text("utf-16").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
-    if (text := _normalize_separators_and_encoding(path, source, head)) is not None:
+    if (text := _normalize_line_ends_and_decimal_commas(path, source, head)) is not None:
         source, head = text, text[:_INSPECTED_HEAD_BYTES]
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
@@ -57,7 +57,11 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         has_header=header,
         separator=separator,
         decimal_comma=separator in ";\t"
-        and any(_DECIMAL_COMMA.fullmatch(cell) for line in rest for cell in line.split(separator)),
+        and any(
+            _DECIMAL_COMMA_CELL_PATTERN.fullmatch(cell)
+            for line in rest
+            for cell in line.split(separator)
+        ),
         skip_lines=before,
         try_parse_dates=True,
     )
@@ -67,7 +71,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     return frame, before + (2 if header else 1)
 
 
-def _normalize_separators_and_encoding(
+def _normalize_line_ends_and_decimal_commas(
     path: Path, source: Path | bytes, head: bytes
 ) -> bytes | None:
     with path.open("rb") as file:

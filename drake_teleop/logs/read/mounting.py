@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, parabola_minimum
+from drake_teleop.common.numeric import Array, position_of_parabola_minimum
 from drake_teleop.common.rotations import right_angled_rotations, rotation_matrices
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import (
     estimate_delay,
-    far_from_gaps,
+    is_far_from_gaps,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -62,11 +62,11 @@ def lag_of_imu_clock(t: Array, pairs: SignalPairs, t_imu: Array, reach: float, a
     best = int(np.argmin(costs))
     lag = float(shifts[best])
     if 0 < best < len(shifts) - 1:
-        lag += step * parabola_minimum(*costs[best - 1 : best + 2])
+        lag += step * position_of_parabola_minimum(*costs[best - 1 : best + 2])
     return lag
 
 
-def estimate_clock_drift(
+def mid_record_lag_and_clock_drift(
     t: Array, pairs: SignalPairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
@@ -116,7 +116,9 @@ MIN_SINGULAR_VALUE_RATIO = 1e-5
 _MAX_RESIDUAL_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def nonlinear_least_squares(residual: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
+def least_squares_with_deviations(
+    residual: Callable[[Array], Array], x: Array
+) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
     `residual` maps x to residuals (N, 3 k), with one weight for each three channels.
@@ -161,7 +163,7 @@ MAX_UNEXPLAINED_SHARE = 0.05
 """Largest unexplained share of the variance of a valid fit."""
 IMU_COMPARISON_CUTOFF_HZ = 8.0
 """Cut-off of the low-pass on all signals [Hz]."""
-MAX_COMPARED_SAMPLES = 1500
+NUM_COMPARED_SAMPLES = 1500
 """Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_MOTION_OVER_NOISE_POWER = 20.0
@@ -197,7 +199,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     smooth = low_pass_log(remove_delay(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = times_outside_gaps(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
-    if len(t) < MAX_COMPARED_SAMPLES // 10:
+    if len(t) < NUM_COMPARED_SAMPLES // 10:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
@@ -213,19 +215,21 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     target = (wrench - wrench.mean(axis=0)).ravel()
     phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_VALUE_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = nonlinear_least_squares(
+    x, deviations = least_squares_with_deviations(
         residual_at, np.concatenate([np.zeros(4), offsets, phi])
     )
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED_SHARE * whole).any():
         return None
-    observable = are_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
+    observable = are_lever_arm_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
 def times_outside_gaps(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
-    t = np.linspace(start, stop, MAX_COMPARED_SAMPLES)
-    known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
+    t = np.linspace(start, stop, NUM_COMPARED_SAMPLES)
+    known = [
+        np.interp(t, log.t, is_far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs
+    ]
     return t[np.all(known, axis=0)]
 
 
@@ -235,7 +239,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
     return cross_matrix(alpha) + W @ W
 
 
-def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
+def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
@@ -250,7 +254,7 @@ MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
 """Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
 MAX_ROTATION_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
-MAX_SHARE_WITHOUT_POSITIONS = 0.005
+MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS = 0.005
 """Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_IMU_LAG_S = 1.0
 
@@ -312,7 +316,7 @@ class Mounting:
         if self.lever_arm is not None:
             return self.unexplained < MAX_UNEXPLAINED_SHARE
         # Without positions the pose determines the angular velocity, but not the acceleration.
-        return omega is not None or self.unexplained < MAX_SHARE_WITHOUT_POSITIONS
+        return omega is not None or self.unexplained < MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS
 
     @property
     def is_determined(self) -> bool:
@@ -331,7 +335,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     cutoff = min(IMU_COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
     sensed, smooth = low_pass_log(imu, cutoff), low_pass_log(pose, cutoff)
     t = times_outside_gaps(start + reach, stop - reach, (imu, pose), cutoff)
-    if len(t) < MAX_COMPARED_SAMPLES // 10:
+    if len(t) < NUM_COMPARED_SAMPLES // 10:
         return None
     # Without a gyroscope both readings contain the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
@@ -347,8 +351,12 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
-    middle, drift = estimate_clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
-    R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
+    middle, drift = mid_record_lag_and_clock_drift(
+        t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0])
+    )
+    R, mirrored = _kabsch_rotation_and_is_mirrored(
+        resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected
+    )
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
@@ -357,19 +365,21 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     pose_omega = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
-    x, deviations, left = _refine_rotation_and_lag(
+    x, deviations, left = _refine_rotation_lag_and_lever_arm(
         t, drift * (t - centre), imu.t, pairs, K, R, middle
     )
     lever = None
     if position:
         lever = LeverArm(
-            x[4:7], np.where(are_axes_observable(K, pose, cutoff), deviations[4:7], np.inf), "pose"
+            x[4:7],
+            np.where(are_lever_arm_axes_observable(K, pose, cutoff), deviations[4:7], np.inf),
+            "pose",
         )
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
-        R_SI=_rotated_by_vector(R, x[:3]),
+        R_SI=_rotated_about_fixed_axes(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
         mid_record_lag_s=float(x[3]),
         mid_record_time_s=centre,
@@ -383,14 +393,14 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
 
 
-def _refine_rotation_and_lag(
+def _refine_rotation_lag_and_lever_arm(
     t: Array, drift_lag: Array, t_imu: Array, pairs: SignalPairs, K: Array, R: Array, lag: float
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
     def pose_residual(x: Array) -> Array:
         resampled = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
-        rotated = resampled @ _rotated_by_vector(R, x[:3]).T
+        rotated = resampled @ _rotated_about_fixed_axes(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]
@@ -398,11 +408,11 @@ def _refine_rotation_and_lag(
     first = np.zeros(7 + 3 * len(pairs))
     first[3] = lag
     first[7:] = -pose_residual(first).mean(axis=0)
-    x, deviations = nonlinear_least_squares(pose_residual, first)
+    x, deviations = least_squares_with_deviations(pose_residual, first)
     return x, deviations, pose_residual(x)
 
 
-def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
+def _kabsch_rotation_and_is_mirrored(x: Array, y: Array) -> tuple[Array, bool]:
     """Return the R that minimises |y - R x - b|, and whether a reflection fits clearly better."""
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)
@@ -412,7 +422,7 @@ def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _rotated_by_vector(R: Array, vector: Array) -> Array:
+def _rotated_about_fixed_axes(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 

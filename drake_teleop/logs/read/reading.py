@@ -58,9 +58,9 @@ from drake_teleop.logs.read.streams import (
 )
 from drake_teleop.logs.read.table_files import (
     TABLE_READERS,
+    note_that_table_needs_description,
     read_table,
     require_file,
-    yaml_only_note,
 )
 from drake_teleop.logs.read.tables import Table, decimal_resolution
 
@@ -106,7 +106,7 @@ def read_log(
     raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
 
 
-def read_description(
+def read_described_log(
     description: Description,
     source: str,
     *,
@@ -189,7 +189,7 @@ class _LogReader:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream_table(stream)
         table = self._tables[stream.source]
-        return table if isinstance(stream, Static) else table.rows_with_numbers(stream.columns)
+        return table if isinstance(stream, Static) else table.rows_with_any_number(stream.columns)
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
@@ -208,7 +208,7 @@ class _LogReader:
         values = table.finite_numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self._description.unit_in_si(quantity.unit) * np.array(quantity.scale)
-        of_table = yaml_only_note(self._source)
+        of_table = note_that_table_needs_description(self._source)
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -227,7 +227,7 @@ class _LogReader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, recorded_poses=raw)
         dt = mean_time_step(t)
-        self._include_window_in_one_sided_ends(dt)
+        self._raise_one_sided_length_to_window(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -278,7 +278,7 @@ class _LogReader:
         s = imu_vectors("specific_force", stream.sign)
         omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._include_window_in_one_sided_ends(dt)
+            self._raise_one_sided_length_to_window(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
@@ -384,7 +384,7 @@ class _LogReader:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _include_window_in_one_sided_ends(self, dt: float) -> None:
+    def _raise_one_sided_length_to_window(self, dt: float) -> None:
         self._one_sided_s = max(self._one_sided_s, self._half_smoother_window_s(dt))
 
     def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:

@@ -17,7 +17,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
+from drake_teleop.common.errors import (
+    DrakeTeleopError,
+    refuse_polars_in_forked_process,
+    wrap_read_errors,
+)
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_hdf5, read_mat, read_zarr
@@ -35,7 +39,7 @@ _MAX_CELLS_IN_MEMORY = 2**24
 """Number of cells above which columns of a Parquet file are read on access."""
 
 
-def yaml_only_note(source: str) -> str:
+def note_that_table_needs_description(source: str) -> str:
     """Return a note on lines of a description for the log of a canonical table, otherwise ""."""
     if Path(source).suffix.lower() not in TABLE_READERS:
         return ""
@@ -49,7 +53,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     """
     kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     require_file(path, folder=kind == ".zarr")
-    refuse_fork()
+    refuse_polars_in_forked_process()
     with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
         columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
@@ -69,7 +73,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_to_numpy(series) for series in frame.get_columns()]
     columns = dict(zip(_strip_column_names(names), found, strict=True))
-    return Table(path, _add_lower_case_names(columns), first_row)
+    return Table(path, _add_lower_case_names_if_canonical(columns), first_row)
 
 
 def _strip_column_names(names: list[str]) -> list[str]:
@@ -79,7 +83,7 @@ def _strip_column_names(names: list[str]) -> list[str]:
     return stripped
 
 
-def _add_lower_case_names(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
+def _add_lower_case_names_if_canonical(columns: dict[str, _ColumnType]) -> dict[str, _ColumnType]:
     small = {name.lower(): column for name, column in columns.items()}
     canonical = len(small) == len(columns) and _WRENCH_COLUMN_NAMES.issubset(small)
     return small | columns if canonical and not _WRENCH_COLUMN_NAMES.issubset(columns) else columns
@@ -109,11 +113,11 @@ def numeric_and_nested_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
 
     Columns of text and binary data, such as images, are omitted.
     """
-    frame = frame.select(numeric_column_names(frame)).collect().lazy()
+    frame = frame.select(numeric_or_nested_column_names(frame)).collect().lazy()
     return _collect_columns(frame, _column_expressions(frame))
 
 
-def numeric_column_names(frame: pl.LazyFrame) -> list[str]:
+def numeric_or_nested_column_names(frame: pl.LazyFrame) -> list[str]:
     """Return the names of the columns of numbers, lists and arrays."""
     import polars as pl
 
@@ -131,7 +135,7 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     for name, dtype in frame.collect_schema().items():
         columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
     _strip_column_names(list(frame.collect_schema()))
-    return _add_lower_case_names(columns)
+    return _add_lower_case_names_if_canonical(columns)
 
 
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:

@@ -46,7 +46,7 @@ class Table:
         """Return the number that a row of this table has in its file, for messages."""
         return self.first_row + int(row if self.kept_rows is None else self.kept_rows[row])
 
-    def rows_with_numbers(self, names: Sequence[str | int]) -> Table:
+    def rows_with_any_number(self, names: Sequence[str | int]) -> Table:
         """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.numbers_with_nan(names[0], "")).all():

@@ -152,7 +152,7 @@ def render_template(name: str, **values: Any) -> str:
 
 
 def _test_vector_header(target: ControllerTarget) -> str:
-    inputs, largest = _simulated_readings(target)
+    inputs, largest = _simulated_readings_and_sensor_range(target)
     python = target.make_compensator(largest, **_TEST_SCALES)
     outputs = [
         python.step(Reading(k, t, row[:NUM_READING_VALUES], gravity=row[NUM_READING_VALUES:]), t)
@@ -167,7 +167,7 @@ def _test_vector_header(target: ControllerTarget) -> str:
     )
 
 
-def _simulated_readings(target: ControllerTarget) -> tuple[Array, Array]:
+def _simulated_readings_and_sensor_range(target: ControllerTarget) -> tuple[Array, Array]:
     """Return rows [wrench, s, omega, alpha, gravity] (N, 18) and a sensor range (6,)."""
     phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])

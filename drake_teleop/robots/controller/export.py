@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import make_folder, whole_file
+from drake_teleop.common.files import make_folder, replace_file_on_success
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.controller.c99 import (
@@ -23,7 +23,7 @@ from drake_teleop.robots.controller.fmu import fmu_files
 from drake_teleop.robots.export import refuse_removed_weight, unused_sensor_pose_error
 
 _FILTER_NAME = "wrench_compensator_filter"
-_TEMPLATE_FOLDER = "ros2_filter"
+_FILTER_TEMPLATE_FOLDER = "ros2_filter"
 
 
 def ros2_filter_files(target: ControllerTarget) -> Files:
@@ -39,9 +39,12 @@ def ros2_filter_files(target: ControllerTarget) -> Files:
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
     return {
-        **{name: read_template(f"{_TEMPLATE_FOLDER}/{file}") for name, file in shipped.items()},
+        **{
+            name: read_template(f"{_FILTER_TEMPLATE_FOLDER}/{file}")
+            for name, file in shipped.items()
+        },
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": render_template(f"{_TEMPLATE_FOLDER}/README.md", **values),
+        "README.md": render_template(f"{_FILTER_TEMPLATE_FOLDER}/README.md", **values),
     }
 
 
@@ -85,7 +88,7 @@ def export_controller(
     for name, content in files.items():
         path = out / name
         make_folder(path.parent)
-        with whole_file(path) as temporary:
+        with replace_file_on_success(path) as temporary:
             data = content.encode() if isinstance(content, str) else content
             temporary.write_bytes(data)
     return notes

@@ -62,7 +62,7 @@ class _PassivityEndBlock(SteppedBlock):
         self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUT_PORTS]
         self._declare_step(results, 3, period)
         self._declare_output("packet", 4, slice(0, PACKET_SIZE))
-        self._declare_outputs()
+        self._declare_end_specific_output()
 
     def _advance(self, context: Context, results: list[Array]) -> None:
         packet = self._received.Eval(context)
@@ -71,7 +71,7 @@ class _PassivityEndBlock(SteppedBlock):
             for port in self._ports
         ]
         received, is_fresh = np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5)
-        self._step_method(inputs, received, is_fresh, *results)
+        self._step_passivity_method(inputs, received, is_fresh, *results)
 
 
 class PassivityAtMaster(_PassivityEndBlock):
@@ -94,10 +94,10 @@ class PassivityAtMaster(_PassivityEndBlock):
     __slots__ = ()
     _INPUT_PORTS = (("pose_command", 7), ("hand_wrench_E", 6))
 
-    def _declare_outputs(self) -> None:
+    def _declare_end_specific_output(self) -> None:
         self._declare_output("wrench_to_master", 3, slice(0, 6))
 
-    def _step_method(
+    def _step_passivity_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
         packet: Any,
     ) -> None:  # fmt: skip
@@ -132,10 +132,10 @@ class PassivityAtSlave(_PassivityEndBlock):
         *(("saturated", 1), ("contact", 1)),
     )
 
-    def _declare_outputs(self) -> None:
+    def _declare_end_specific_output(self) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
-    def _step_method(
+    def _step_passivity_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,
         packet: Any,
     ) -> None:  # fmt: skip

@@ -11,7 +11,11 @@ from pydrake.systems.framework import Context, LeafSystem
 from drake_teleop.common.blocks import DoubleOnly
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.regressor import FIRST_JOINT_INDEX, SAMPLE_SPECIFIC_FORCE, signals_of_sample
+from drake_teleop.load.regressor import (
+    FIRST_JOINT_INDEX,
+    SAMPLE_SPECIFIC_FORCE,
+    signal_sizes_of_sample,
+)
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
@@ -19,7 +23,7 @@ class _SamplePorts:
     """Input ports for the parts of a sensor sample, instead of one port `sample`."""
 
     def __init__(self, system: LeafSystem) -> None:
-        sizes = list(signals_of_sample(0).items())[:-1]
+        sizes = list(signal_sizes_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
@@ -122,9 +126,13 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
     def _declare_sample_ports(self, arm: Any) -> Any:
         return _SamplePorts(self)
 
-    def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
+    def _next_contact_flag(
+        self, context: Context, memory: Array, sample: Array, estimate: Array
+    ) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
         acceleration = sample[SAMPLE_SPECIFIC_FORCE] + gravity
         return bool(
-            contact_detection.update_flag(memory, sample, estimate, acceleration, self._settings)
+            contact_detection.update_contact_flag_with_sample(
+                memory, sample, estimate, acceleration, self._settings
+            )
         )

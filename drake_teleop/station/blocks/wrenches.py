@@ -14,7 +14,7 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.load.compensation import (
-    add_weight_into,
+    add_excess_weight_into,
     scaled_wrench_into,
     unknown_gravity_error,
 )
@@ -169,7 +169,9 @@ def WrenchScaling_(T: Any) -> Any:
                     raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 parts = self._parts(self._inputs[-1].Eval(context))
-                _compiled_or_python_function(add_weight_into, T)(gravity, *parts, *excess, wrench)
+                _compiled_or_python_function(add_excess_weight_into, T)(
+                    gravity, *parts, *excess, wrench
+                )
             return wrench
 
         def _calc_to_master(self, context: Any, output: Any) -> None:

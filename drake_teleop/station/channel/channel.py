@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteStateIndex
 
-from drake_teleop.common.blocks import all_in_range
+from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -87,8 +87,8 @@ _ENDS_STATE_SIZE = (
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
 # Last finite command (7); 1 if the newest command is not finite.
-_LAST_FINITE_MASTER_POSE = _layout.vector(8)
-_LAST_FINITE_SLAVE_POSE = _layout.vector(8)  # pose of the slave, likewise
+_LAST_FINITE_MASTER_POSE_AND_FLAG = _layout.vector(8)
+_LAST_FINITE_SLAVE_POSE_AND_FLAG = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_HAND_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _LAST_VALID_SLAVE_WRENCH = _layout.vector(6)  # slave's wrench at the last step
 _TIME_WITH_VALID_SLAVE_WRENCH = _layout.number()  # time with valid wrenches [s]
@@ -115,7 +115,7 @@ _ZERO_LOAD_WRENCH = np.zeros(6)
 def initial_state_of_ends(method: str, parameters: Array, start: Array) -> Array:
     """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_ENDS_STATE_SIZE)
-    ends[_LAST_FINITE_MASTER_POSE][:7] = ends[_LAST_FINITE_SLAVE_POSE][:7] = start
+    ends[_LAST_FINITE_MASTER_POSE_AND_FLAG][:7] = ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = start
     ends[_TIME_WITH_VALID_SLAVE_WRENCH] = safe_state.STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = safe_state.initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = safe_state.initial_slave_monitor(start)
@@ -173,16 +173,16 @@ def step_master_end(
     `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
     hand is added to `work` (2,) [J].
     """
-    before, held = ends[_LAST_FINITE_MASTER_POSE], ends[_RENDERED_HAND_WRENCH]
+    before, held = ends[_LAST_FINITE_MASTER_POSE_AND_FLAG], ends[_RENDERED_HAND_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
-    valid = _pose_increment_into(pose_command, before, dx)
+    valid = _update_pose_and_write_increment(pose_command, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
-    if all_in_range(hand_B):
+    if are_finite_and_in_range(hand_B):
         _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
@@ -207,18 +207,18 @@ def step_slave_end(
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
-    before, held = ends[_LAST_FINITE_SLAVE_POSE], ends[_LAST_VALID_SLAVE_WRENCH]
+    before, held = ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG], ends[_LAST_VALID_SLAVE_WRENCH]
     watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
     work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
-    valid = _pose_increment_into(slave_pose, before, dx)
+    valid = _update_pose_and_write_increment(slave_pose, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         work[g] += dot_of_group(held, dx, g)
     load = memory[LOAD_WRENCH]
-    if not (all_in_range(wrench_B) and all_in_range(load_B)):
+    if not (are_finite_and_in_range(wrench_B) and are_finite_and_in_range(load_B)):
         valid = False
         ends[_TIME_WITH_VALID_SLAVE_WRENCH] = 0.0
     elif saturated:
@@ -251,9 +251,9 @@ def step_slave_end(
 
 
 @njit(cache=True)
-def _pose_increment_into(pose, before, dx):
+def _update_pose_and_write_increment(pose, before, dx):
     """Write the change `dx` (6,), 0 unless both are finite; return whether `pose` is finite."""
-    valid = all_in_range(pose)
+    valid = are_finite_and_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
         copy_into(before, 0, pose, 0, 7)
@@ -374,7 +374,7 @@ class TeleopChannel(SteppedBlock):
         time in which the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_FINITE_SLAVE_POSE][:7] = slave
+        ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = slave
         ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fills
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
+from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.numeric import Array
@@ -72,7 +72,7 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        check_ranges(self, where)
+        check_all_field_values(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
                 f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad state",

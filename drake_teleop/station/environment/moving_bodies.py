@@ -43,7 +43,9 @@ NUM_JOINT_COLUMNS = 21
 BODY_STATE_SIZE = 13
 
 
-def MakeJointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
+def MakeJointTableAndRowBodies(
+    plant: MultibodyPlant, bodies: Iterable[BodyIndex]
+) -> tuple[Array, list[int]]:
     """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
     Columns: 0 row of the parent body, or -1 if it is anchored; 1 type of joint; 2 and 3 first
@@ -96,7 +98,8 @@ def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
 def poses_and_twists_into(joints, state, out):
     """Write pose and twist of m bodies at the plant's state [q; v] into `out` (m, 13).
 
-    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is from `MakeJointTable`.
+    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `MakeJointTableAndRowBodies`
+    returns `joints`.
     """
     still = (0.0, 0.0, 0.0)
     for k in range(joints.shape[0]):
@@ -142,7 +145,7 @@ def poses_and_twists_into(joints, state, out):
 
 
 @njit(cache=True)
-def _interpolate_hermite(h, u, a, a_dot, b, b_dot):
+def _hermite_value_and_rate(h, u, a, a_dot, b, b_dot):
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))
@@ -158,26 +161,27 @@ def _quaternion_rate(spin, turn):
 def interpolate_joint_state(joints, h, u, start, end, out):
     """Write the state [q; v] at the fraction u of a step of h [s] into `out` (Hermite cubics).
 
-    `start` and `end` are the plant's states at both ends, `joints` is from `MakeJointTable`.
+    `start` and `end` are the plant's states at both ends; `MakeJointTableAndRowBodies` returns
+    `joints`.
     """
     for k in range(joints.shape[0]):
         row = joints[k]
         q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])
         kind = row[_JOINT_TYPE_COLUMN]
         if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
-            out[q], out[v] = _interpolate_hermite(h, u, start[q], start[v], end[q], end[v])
+            out[q], out[v] = _hermite_value_and_rate(h, u, start[q], start[v], end[q], end[v])
         elif kind == _FREE_JOINT:
             for i in range(3):
-                out[q + 4 + i], out[v + 3 + i] = _interpolate_hermite(
+                out[q + 4 + i], out[v + 3 + i] = _hermite_value_and_rate(
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
             a, b = quaternion_at(start, q), quaternion_at(end, q)
             a_dot = _quaternion_rate(vector_at(start, v), a)
             b_dot = _quaternion_rate(vector_at(end, v), b)
-            w, w_dot = _interpolate_hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
-            x, x_dot = _interpolate_hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
-            y, y_dot = _interpolate_hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])
-            z, z_dot = _interpolate_hermite(h, u, a[3], a_dot[3], b[3], b_dot[3])
+            w, w_dot = _hermite_value_and_rate(h, u, a[0], a_dot[0], b[0], b_dot[0])
+            x, x_dot = _hermite_value_and_rate(h, u, a[1], a_dot[1], b[1], b_dot[1])
+            y, y_dot = _hermite_value_and_rate(h, u, a[2], a_dot[2], b[2], b_dot[2])
+            z, z_dot = _hermite_value_and_rate(h, u, a[3], a_dot[3], b[3], b_dot[3])
             out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
             spin = quaternion_product(
                 (w_dot, x_dot, y_dot, z_dot), conjugate_quaternion((w, x, y, z))

@@ -37,7 +37,7 @@ PAIR_STIFFNESS_COLUMN, PAIR_FRICTION_COLUMNS, BOX_BODY_ROW_COLUMN = 22, slice(24
 #: Number of columns of `ShapePairs.compiled_pairs` and `ShapePairs.monitored_pairs`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
-_MIN_SLIP_SPEED_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
+_SLIP_SPEED_REGULARIZATION_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class ShapePairs(NamedTuple):
@@ -72,7 +72,7 @@ def FindContactPairs(
     Args:
         tool: pose X_SBody of its body, for each shape of the tool.
         slip_speed: sliding speed of full friction [m/s], the plant's stiction tolerance.
-        moving: body index of each row of a joint table (`MakeJointTable`).
+        moving: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
 
     Raises:
         DrakeTeleopError: for an unbounded shape.
@@ -225,7 +225,7 @@ def depth_of_sphere_in_box(
 
 
 @njit(cache=True)
-def min_distance_of_boxes(
+def lower_bound_of_box_distance(
     pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
@@ -263,7 +263,9 @@ def _friction_coefficient(static: float, dynamic: float, slip_ratio: float) -> f
 
 
 @njit(cache=True)
-def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
+def point_contact_force_into(
+    pair: Array, x: float, normal: Array, velocity: Array, force: Array
+) -> None:
     """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
     `pair` is a row of `ShapePairs.compiled_pairs`, `x` the depth [m], `normal` the direction out of
@@ -275,7 +277,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     for i in range(3):
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
-    speed = np.sqrt(speed + _MIN_SLIP_SPEED_M_S * _MIN_SLIP_SPEED_M_S)
+    speed = np.sqrt(speed + _SLIP_SPEED_REGULARIZATION_M_S * _SLIP_SPEED_REGULARIZATION_M_S)
     mu = _friction_coefficient(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
@@ -24,7 +24,7 @@ from drake_teleop.load.regressor import (
     SATURATION_FLAG_INDEX,
     sample_size,
 )
-from drake_teleop.station.slave.arm import ArmModel, sensor_acceleration_into
+from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_force_into
 
 
 @settings
@@ -47,17 +47,17 @@ class ContactDetectionConfig:
 def _contact_flag_with_arm(memory, sample, estimate, arm, settings):
     acceleration = np.empty(3)
     q = sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]
-    sensor_acceleration_into(arm, q, sample[SAMPLE_SPECIFIC_FORCE], acceleration)
-    return update_flag(memory, sample, estimate, acceleration, settings)
+    acceleration_from_specific_force_into(arm, q, sample[SAMPLE_SPECIFIC_FORCE], acceleration)
+    return update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings)
 
 
 @njit(cache=True)
-def update_flag(memory, sample, estimate, acceleration, settings):
+def update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings):
     """Update the memory of a contact detector with a sample; return whether there is contact.
 
     `acceleration` (3,) is that of So, in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
-    if not (all_in_range(sample) and all_in_range(estimate)):
+    if not (are_finite_and_in_range(sample) and are_finite_and_in_range(estimate)):
         return memory[FLAG_INDEX] != 0.0
     contact = np.empty(6)
     s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
@@ -102,17 +102,19 @@ class ContactDetection(LeafSystem):
         self._recovery = round(config.recovery / period)
         self._blind_samples = self.DeclareDiscreteState(1)  # remaining samples without detection
         self.DeclareStateOutputPort("contact", self._flag)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_contact_flag_state)
 
     def _declare_sample_ports(self, arm: ArmModel | None) -> Any:
         assert arm is not None
         self._arm = arm.table
         return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
 
-    def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
+    def _next_contact_flag(
+        self, context: Context, memory: Array, sample: Array, estimate: Array
+    ) -> bool:
         return bool(_contact_flag_with_arm(memory, sample, estimate, self._arm, self._settings))
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         blind = discrete_state.get_mutable_value(self._blind_samples)
         if sample[SATURATION_FLAG_INDEX] > 0.5:
@@ -124,4 +126,4 @@ class ContactDetection(LeafSystem):
         memory = discrete_state.get_mutable_value(self._memory)
         estimate = self._estimate.Eval(context)
         flag = discrete_state.get_mutable_value(self._flag)
-        flag[0] = self._next_flag(context, memory, sample, estimate)
+        flag[0] = self._next_contact_flag(context, memory, sample, estimate)

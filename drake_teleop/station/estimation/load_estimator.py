@@ -123,12 +123,12 @@ class LoadEstimator(LeafSystem):
                 *change,
             )
         if config.enabled or config.watch:
-            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_or_monitor_load)
 
     def _declare_sample_ports(self, size: int) -> Any:
         return self.DeclareVectorInputPort("sample", size)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_or_monitor_load(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return

@@ -23,7 +23,7 @@ PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
 
 @settings
 @dataclass
-class JointFriction:
+class PhantomJointFriction:
     """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
     # Sources as in `phantom`: main axes P, wrist estimated.
@@ -115,7 +115,7 @@ class Master:
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
-    friction: JointFriction = field(default_factory=JointFriction)
+    friction: PhantomJointFriction = field(default_factory=PhantomJointFriction)
     figures: DeviceFigures | None = plain(
         None, "values in place of those of the device's data sheet; null: the data sheet's"
     )
@@ -166,12 +166,12 @@ class Master:
         figures = self._data_sheet()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
-    def sampling_period(self, hand_hz: float) -> float | None:
+    def sampling_period_if_slower_than_hand(self, hand_hz: float) -> float | None:
         """Return the sampling period [s] of a device slower than `hand_hz` [Hz], else None."""
         rate = 0.0 if self.model in (PHANTOM_NAME, LEADER_NAME) else self._data_sheet().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
-    def without_coulomb_friction(self) -> "Master":
+    def without_coulomb_friction_and_encoder_steps(self) -> "Master":
         """Return a copy without Coulomb friction and encoder steps."""
         if self.model == PHANTOM_NAME:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
@@ -191,7 +191,7 @@ class Master:
             what = "the Phantom has fixed dynamics and accepts no data sheet"
             remedy = "leave them out, or choose another model, such as custom"
             raise DrakeTeleopError(what, where=f"{where}.figures", remedy=remedy)
-        if self.model != PHANTOM_NAME and self.friction != JointFriction():
+        if self.model != PHANTOM_NAME and self.friction != PhantomJointFriction():
             what = f"only the Phantom accepts joint friction, not model '{self.model}'"
             remedy = "leave it out, and set figures.friction and figures.damping"
             raise DrakeTeleopError(what, where=f"{where}.friction", remedy=remedy)

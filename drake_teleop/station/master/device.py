@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drake_teleop.common.blocks import all_in_range
+from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -19,10 +19,10 @@ _MAX_DEVICE_PERIOD_S = 1e-3  # s, slower than any haptic device
 _MAX_STABLE_RATE_TIMES_PERIOD = 2.0
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def _advance_device(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    if all_in_range(hand_wrench) and all_in_range(drive[:6]):
+    if are_finite_and_in_range(hand_wrench) and are_finite_and_in_range(drive[:6]):
         step_device(state, hand_wrench, drive[:6], device, period, work, stages)
         pose_into(state[:6], device, pose)
         twist_into(state[:6], state[6:], device, work[0], twist)

@@ -24,12 +24,12 @@ def jacobian_into(q, device, J):
 
 
 @njit(cache=True)
-def gravity_torque_into(q, device, out):
+def gravity_compensation_torque_into(q, device, out):
     """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
     if device.in_task_space:
         out[:6] = 0.0
     else:
-        phantom.gravity_torque_into(q, out)
+        phantom.gravity_compensation_torque_into(q, out)
 
 
 @njit(cache=True)
@@ -112,7 +112,7 @@ class HapticDevice(HapticDeviceBase):
     def friction_setting_path(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
-    def coordinates_for_display(self, q: Array) -> Array:
+    def coordinates_for_force_display(self, q: Array) -> Array:
         return q
 
     @property
@@ -137,11 +137,11 @@ class HapticDevice(HapticDeviceBase):
         else:
             task_space.check_limits(q, self.parameters)
 
-    def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         """Return for each row of q (N, 6) whether an end stop is active."""
         if self.is_phantom:
-            return phantom.is_at_end_stop(q)
-        return task_space.is_at_end_stop(q, self.parameters)
+            return phantom.is_any_axis_at_end_stop(q)
+        return task_space.is_any_axis_at_end_stop(q, self.parameters)
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, 6))

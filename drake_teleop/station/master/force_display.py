@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.device_parameters import DeviceParameters
 from drake_teleop.station.master.dynamics import (
     HapticDeviceBase,
-    gravity_torque_into,
+    gravity_compensation_torque_into,
     jacobian_into,
 )
 from drake_teleop.station.passivity.memory import SlotAllocator
@@ -32,11 +32,20 @@ from drake_teleop.station.passivity.safe_state import (
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
-_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
-DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
-_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
-_MONITOR_SLOTS = _layout.vector(MASTER_MONITOR_SIZE)
+_display_memory_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
+_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = (
+    _display_memory_layout.vector(6),
+    _display_memory_layout.vector(6),
+)
+DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = (
+    _display_memory_layout.vector(6),
+    _display_memory_layout.number(),
+)
+_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = (
+    _display_memory_layout.number(),
+    _display_memory_layout.number(),
+)
+_SAFE_STATE_MONITOR_SLOTS = _display_memory_layout.vector(MASTER_MONITOR_SIZE)
 _DISPLAYED_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
@@ -44,14 +53,16 @@ _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
 
 
 @njit(cache=True)
-def _peak_wrench_of_device(parameters):
+def _peak_force_and_torque_of_device(parameters):
     return np.array([parameters.peak_force, parameters.peak_torque.max()])
 
 
 def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
-    display = np.zeros(_MONITOR_SLOTS.stop)
+    display = np.zeros(_SAFE_STATE_MONITOR_SLOTS.stop)
     display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
-    display[_MONITOR_SLOTS] = initial_master_monitor(_peak_wrench_of_device(parameters))
+    display[_SAFE_STATE_MONITOR_SLOTS] = initial_master_monitor(
+        _peak_force_and_torque_of_device(parameters)
+    )
     return display
 
 
@@ -79,25 +90,25 @@ def limit_wrench_into(wrench, parameters, J, displayed):
 @njit(cache=True)
 def motor_torque_into(displayed, q, parameters, J, torque):
     """Write motor torques (6,), J^T `displayed` plus gravity compensation at q, into `torque`."""
-    gravity_torque_into(q, parameters, torque)
+    gravity_compensation_torque_into(q, parameters, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def step_display(wrench, device, parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
     `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
     q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
-    copy_into(drive, 6, device, 6, _MONITOR_SLOTS.stop - 6)
-    if all_in_range(q):
+    copy_into(drive, 6, device, 6, _SAFE_STATE_MONITOR_SLOTS.stop - 6)
+    if are_finite_and_in_range(q):
         copy_into(drive, _LAST_VALID_POSITIONS_SLOTS.start, q, 0, 6)
     else:
         q, fault = device[_LAST_VALID_POSITIONS_SLOTS], _HAND_FAULT
-    if not all_in_range(wrench):
+    if not are_finite_and_in_range(wrench):
         fault = _WRENCH_FAULT
     displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_WRENCH_SLOTS], fault
     jacobian_into(q, parameters, J)
@@ -110,7 +121,7 @@ def step_display(wrench, device, parameters, period, J, drive):
 @njit(cache=True)
 def _fade_wrench_after_fault(device, parameters, period, drive):
     displayed, last = drive[DISPLAYED_WRENCH_SLOTS], device[DISPLAYED_WRENCH_SLOTS]
-    limits, device_limits = np.empty(2), _peak_wrench_of_device(parameters)
+    limits, device_limits = np.empty(2), _peak_force_and_torque_of_device(parameters)
     fault = drive[_FAULT_SLOT] != _NO_FAULT
     drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
     # Complete within STOP_TIME_S, so that the direction does not jump either.
@@ -118,7 +129,7 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     master_limits_into(
-        not fault, fault, period, 0.0, device_limits, last, drive[_MONITOR_SLOTS], limits
+        not fault, fault, period, 0.0, device_limits, last, drive[_SAFE_STATE_MONITOR_SLOTS], limits
     )
     drive[_IS_WRENCH_REDUCED_SLOT] = 0.0
     for g in range(2):
@@ -150,7 +161,7 @@ class DeviceBlock(LeafSystem):
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
         display = initial_display_state(
-            device.coordinates_for_display(q_initial), device.parameters
+            device.coordinates_for_force_display(q_initial), device.parameters
         )
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
@@ -195,10 +206,10 @@ class ForceDisplay(LeafSystem):
         self._parameters = device.parameters
         self._jacobian = np.zeros((6, 6))
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self._device = self.DeclareVectorInputPort("for_display", _MONITOR_SLOTS.stop)
+        self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
         inputs = {self.all_input_ports_ticket()}
         self._drive = self.DeclareVectorOutputPort(
-            "drive", _MONITOR_SLOTS.stop, weak_callback(self._calc_drive), inputs
+            "drive", _SAFE_STATE_MONITOR_SLOTS.stop, weak_callback(self._calc_drive), inputs
         )
         # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from drake_teleop.common.blocks import all_in_range
+from drake_teleop.common.blocks import are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
@@ -37,14 +37,14 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 # Rows of `LeaderDevice.joint_table`.
 _COULOMB_ROW, _DAMPING_ROW, _MIN_Q_ROW, _MAX_Q_ROW, _STOP_STIFFNESS_ROW = range(5)
 _STOP_DAMPING_ROW, _TORQUE_LIMIT_ROW, _CARRIED_WEIGHT_SHARE_ROW = range(5, 8)
-# Coulomb friction is proportional to tanh(speed / FRICTION_TANH_SPEED): a slower joint creeps.
-FRICTION_TANH_SPEED = 0.02  # rad/s or m/s, estimate
+# Coulomb friction is proportional to the tanh of speed over this one: a slower joint creeps.
+LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
 _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
-def leader_acceleration(arm, joint_table, q, v, applied, motor, vdot):
+def leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
     `applied` (6,) is the hand's wrench minus the hand's weight, [f; tau] on E, in B.
@@ -57,7 +57,9 @@ def leader_acceleration(arm, joint_table, q, v, applied, motor, vdot):
     for i in range(3):
         wrench[3 + i] += moment[i]
     for i in range(n):
-        tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(v[i] / FRICTION_TANH_SPEED)
+        tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(
+            v[i] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+        )
         tau[i] -= joint_table[_DAMPING_ROW, i] * v[i]
         lower, upper, stiffness, damping = joint_table[_MIN_Q_ROW : _STOP_DAMPING_ROW + 1, i]
         tau[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
@@ -84,7 +86,7 @@ def _update_pose_and_twist(arm, q, v, pose, twist):
 
 
 @njit(cache=True)
-def motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
+def limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
     F (6,) is the wrench at E; `arm_without_hand` is `ArmModel.table` without the hand.
@@ -113,7 +115,11 @@ def step_leader(
     """
     n = joint_table.shape[1]
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
-    if all_in_range(hand_wrench) and all_in_range(drive[:6]) and all_in_range(state):
+    if (
+        are_finite_and_in_range(hand_wrench)
+        and are_finite_and_in_range(drive[:6])
+        and are_finite_and_in_range(state)
+    ):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
@@ -123,12 +129,14 @@ def step_leader(
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
-        motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
+        limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
             copy_into(slope, 0, stage, n, n)
-            leader_acceleration(arm, joint_table, stage[:n], stage[n:], applied, motor, slope[n:])
+            leader_acceleration_into(
+                arm, joint_table, stage[:n], stage[n:], applied, motor, slope[n:]
+            )
             weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
             ahead = 1.0 if i == 2 else 0.5
             for k in range(2 * n):
@@ -138,14 +146,14 @@ def step_leader(
             state[k] += period * total[k]
         _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
-        display[i] = pose[4 + i] if all_in_range(state) else math.nan
+        display[i] = pose[4 + i] if are_finite_and_in_range(state) else math.nan
 
 
 @njit(cache=True)
 def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
-    motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
+    limited_leader_motor_torques_into(arm_without_hand, arm, joint_table, q, np.zeros(6), weight)
     jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
@@ -159,11 +167,13 @@ def _limit_wrench_to_motor_torques(arm_without_hand, arm, joint_table, q, wrench
 
 
 @njit(cache=True)
-def _flag_motors_at_limit(arm_without_hand, arm, joint_table, q, F, share):
+def _flag_rows_with_motor_at_limit(arm_without_hand, arm, joint_table, q, F, share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
-        motor_torques_into(arm_without_hand, arm, joint_table, q[row], F[row], torque)
+        limited_leader_motor_torques_into(
+            arm_without_hand, arm, joint_table, q[row], F[row], torque
+        )
         for i in range(n):
             flags[row] |= abs(torque[i]) >= share * joint_table[_TORQUE_LIMIT_ROW, i]
     return flags
@@ -201,7 +211,7 @@ class LeaderDevice(HapticDeviceBase):
     def compiled_constants(self) -> tuple[Array, Array, Array]:
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
-    def coordinates_for_display(self, q: Array) -> Array:
+    def coordinates_for_force_display(self, q: Array) -> Array:
         """Return the vector (6,) for the force display: position of E (3) [m], three zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
@@ -234,16 +244,18 @@ class LeaderDevice(HapticDeviceBase):
                 remedy="start within the limits of its joints",
             )
 
-    def is_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
+    def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
         """Return flags (N,): True if a motor has `share` of its torque limit or more.
 
         The motors carry the arm's weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         tables = self.compiled_constants
-        flags: NDArray[np.bool_] = _flag_motors_at_limit(*tables, q.copy(), F.copy(), share)
+        flags: NDArray[np.bool_] = _flag_rows_with_motor_at_limit(
+            *tables, q.copy(), F.copy(), share
+        )
         return flags
 
-    def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
@@ -256,10 +268,12 @@ class LeaderDevice(HapticDeviceBase):
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
         own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
-        return np.diag(own + creeping * self.joint_table[_COULOMB_ROW] / FRICTION_TANH_SPEED)
+        return np.diag(
+            own + creeping * self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+        )
 
 
-def make_joint_table(
+def make_leader_joint_table(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
     """Return `LeaderDevice.joint_table` (8, n); the end stops scale with the inertia at home.

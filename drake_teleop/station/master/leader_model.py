@@ -13,7 +13,7 @@ from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, as_compiled_arguments
 from drake_teleop.station.master.device_parameters import DeviceParameters
-from drake_teleop.station.master.leader import LeaderDevice, make_joint_table
+from drake_teleop.station.master.leader import LeaderDevice, make_leader_joint_table
 from drake_teleop.station.slave.arm import (
     PHI_COLUMN,
     ROTATION_COLUMN,
@@ -24,7 +24,7 @@ from drake_teleop.station.slave.arm import (
 )
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, values_per_joint
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.models import ParsedModel, ParseModel
+from drake_teleop.station.slave.models import ParsedArm, ParseModel
 
 JOINT_MODE = "joints"
 
@@ -69,7 +69,7 @@ class Leader:
 
     def add_to_plant(
         self, plant: MultibodyPlant, X_Table: RigidTransform | None = None
-    ) -> ParsedModel:
+    ) -> ParsedArm:
         """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world."""
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
         X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
@@ -88,7 +88,7 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home_positions(arm)
-        arm_without_hand = _with_end_frame_E(arm, home, np.array(position))
+        arm_without_hand = _with_end_frame_E_placed_at_home(arm, home, np.array(position))
         phi = arm_without_hand.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
@@ -97,7 +97,9 @@ class Leader:
         viscous = values_per_joint(arm, self.damping, "master.leader.damping", 0.0)
         limits = self.torque_limit, "master.leader.torque_limit", arm.effort_limit
         limit = values_per_joint(arm, *limits)
-        joint_table = make_joint_table(held, home, coulomb, viscous, limit, self.weight_carried)
+        joint_table = make_leader_joint_table(
+            held, home, coulomb, viscous, limit, self.weight_carried
+        )
         peak = self.peak_force, np.full(3, self.peak_torque)
         parameters = as_compiled_arguments(DeviceParameters(hand_mass, hand_inertia, *peak))
         return LeaderDevice(held, arm_without_hand, joint_table, home, parameters)
@@ -109,7 +111,7 @@ class Leader:
         return np.where(within, 0.0, arm.middle_positions)
 
 
-def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)

@@ -51,7 +51,7 @@ WRIST_LINK_INERTIA_KG_M2 = 5e-5  # kg m^2, each wrist link, about every axis, es
 JOINT_LOWER_RAD = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
 JOINT_UPPER_RAD = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
 #: Range of q2 - q3 [rad], limited by the five-bar, P.
-FIVE_BAR_RANGE_RAD = (math.radians(-55.0), math.radians(65.0))
+Q2_MINUS_Q3_RANGE_RAD = (math.radians(-55.0), math.radians(65.0))
 PEAK_FORCE_N = 37.5  # N, peak at the gimbal point, D
 PEAK_WRIST_TORQUES_N_M = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
 
@@ -148,7 +148,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 
 @njit(cache=True)
-def gravity_torque_into(q, out):
+def gravity_compensation_torque_into(q, out):
     weight = WRIST_MASS_KG * GRAVITY_M_S2
     out[0] = 0.0
     out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
@@ -200,7 +200,7 @@ def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
         damping = _MAIN_STOP_DAMPING_N_M_S_RAD if i < 3 else _WRIST_STOP_DAMPING_N_M_S_RAD
         lower, upper = JOINT_LOWER_RAD[i], JOINT_UPPER_RAD[i]
         torque[i] += end_stop_force(q[i], v[i], lower, upper, stiffness, damping)
-    (lower, upper), angle, rate = FIVE_BAR_RANGE_RAD, q[1] - q[2], v[1] - v[2]
+    (lower, upper), angle, rate = Q2_MINUS_Q3_RANGE_RAD, q[1] - q[2], v[1] - v[2]
     stiffness, damping = _MAIN_STOP_STIFFNESS_N_M_RAD, _MAIN_STOP_DAMPING_N_M_S_RAD
     five_bar = end_stop_force(angle, rate, lower, upper, stiffness, damping)
     torque[1] += five_bar
@@ -216,7 +216,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot)
     J, M = work[0], work[1]
     jacobian_into(q, J)
     mass_matrix_into(q, J, device.hand_mass, device.hand_inertia, M)
-    gravity_torque_into(q, vdot)
+    gravity_compensation_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
@@ -276,10 +276,10 @@ def serial_joint_angles(q: Array) -> Array:
     return serial
 
 
-def is_at_end_stop(q: Array) -> NDArray[np.bool_]:
+def is_any_axis_at_end_stop(q: Array) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER_RAD) | (q > JOINT_UPPER_RAD)).any(axis=1)
-    return beyond | (folded < FIVE_BAR_RANGE_RAD[0]) | (folded > FIVE_BAR_RANGE_RAD[1])
+    return beyond | (folded < Q2_MINUS_Q3_RANGE_RAD[0]) | (folded > Q2_MINUS_Q3_RANGE_RAD[1])
 
 
 def check_limits(q: Array) -> None:
@@ -292,7 +292,7 @@ def check_limits(q: Array) -> None:
                 where="pose_master",
                 remedy="choose a start pose inside the device's workspace",
             )
-    if not FIVE_BAR_RANGE_RAD[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE_RAD[1] + margin:
+    if not Q2_MINUS_Q3_RANGE_RAD[0] - margin <= q[1] - q[2] <= Q2_MINUS_Q3_RANGE_RAD[1] + margin:
         raise DrakeTeleopError(
             f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
             where="pose_master",

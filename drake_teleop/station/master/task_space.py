@@ -131,7 +131,7 @@ def _is_past_end_stop(q: Array, device: DeviceParameters, margin: float) -> NDAr
     return np.abs(q - centre) > half + margin
 
 
-def is_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
+def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
     return (
         _is_past_end_stop(q, device, 0.0) & np.append([True] * 3, device.max_rotation > 0.0)
     ).any(axis=1)

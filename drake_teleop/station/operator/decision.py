@@ -193,7 +193,7 @@ def _plan_submovement(person, memory, step, time, error_W):
 
 
 @njit(cache=True)
-def _contact_force_against_axis(task, person, felt):
+def _contact_force_at_tool_along_approach(task, person, felt):
     along = 0.0
     for i in range(3):
         axis_B = 0.0
@@ -204,7 +204,7 @@ def _contact_force_against_axis(task, person, felt):
 
 
 @njit(cache=True)
-def _update_criterion_met(memory, time, good, still_good):
+def _update_criterion_with_hysteresis(memory, time, good, still_good):
     if memory[_CRITERION_MET_SINCE] < 0.0 and good:
         memory[_CRITERION_MET_SINCE] = time
     elif not still_good:
@@ -257,7 +257,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
         if task.kind == KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _update_criterion_met(memory, time, True, True)
+            _update_criterion_with_hysteresis(memory, time, True, True)
             and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
@@ -268,7 +268,7 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _perceived_target_into(task, person, out):
+def _perceived_standoff_target_into(task, person, out):
     depth = 0.0
     if task.kind != KIND_REACH:
         depth = person.depth_error * _draw_normal_number(person, 0, 15)
@@ -279,9 +279,9 @@ def _perceived_target_into(task, person, out):
 
 
 @njit(cache=True)
-def _perceived_penetration(task, person, seen_W):
+def _perceived_depth_beyond_surface(task, person, seen_W):
     target, beyond = np.empty(3), -task.standoff
-    _perceived_target_into(task, person, target)
+    _perceived_standoff_target_into(task, person, target)
     for i in range(3):
         beyond += (seen_W[i] - target[i]) * task.approach_axis[i]
     return beyond
@@ -290,13 +290,15 @@ def _perceived_penetration(task, person, seen_W):
 @njit(cache=True)
 def _move_by_vision(task, person, step, time, seen_W, state, memory):
     error = np.empty(3)
-    _perceived_target_into(task, person, error)
+    _perceived_standoff_target_into(task, person, error)
     off = 0.0
     for i in range(3):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _update_criterion_met(memory, time, off <= 0.8 * task.radius, off <= task.radius)
+    met = _update_criterion_with_hysteresis(
+        memory, time, off <= 0.8 * task.radius, off <= task.radius
+    )
     if task.kind == KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -322,7 +324,7 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         plan_stop(memory, time)
         _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_penetration(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
+    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _GIVE_UP_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
@@ -342,7 +344,7 @@ def _perceived_contact_force(task, person, felt, memory):
     error = person.weber_fraction * _draw_normal_number(
         person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3
     )
-    return (1.0 + error) * _contact_force_against_axis(task, person, felt)
+    return (1.0 + error) * _contact_force_at_tool_along_approach(task, person, felt)
 
 
 @njit(cache=True)
@@ -363,7 +365,7 @@ def _displacement_to_set_force(task, memory, force):
 def _control_press_force(task, person, step, time, felt, state, memory):
     force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task.force - force)
-    met = _update_criterion_met(
+    met = _update_criterion_with_hysteresis(
         memory, time, error <= 0.5 * task.tolerance, error <= task.tolerance
     )
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
@@ -376,7 +378,7 @@ def _control_press_force(task, person, step, time, felt, state, memory):
 
 @njit(cache=True)
 def _lateral_force_into(task, person, felt, out):
-    along, size = _contact_force_against_axis(task, person, felt), 0.0
+    along, size = _contact_force_at_tool_along_approach(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task.approach_axis[i]
         for k in range(3):
@@ -390,7 +392,7 @@ def _lateral_force_into(task, person, felt, out):
 def _is_tool_stuck(task, person, felt):
     limit = _STUCK_SHARE_OF_PUSH_FORCE * task.force
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
-    return _contact_force_against_axis(task, person, felt) >= limit or sideways >= limit
+    return _contact_force_at_tool_along_approach(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
@@ -405,7 +407,7 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_penetration(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
+    deep = _perceived_depth_beyond_surface(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
     if deep and abs(force - task.force) <= _STUCK_SHARE_OF_PUSH_FORCE * task.force:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return

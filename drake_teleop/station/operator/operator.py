@@ -183,7 +183,7 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 
 @njit(cache=True)
-def normalize_pose_into(pose, twist, out):
+def check_motion_and_normalize_pose_into(pose, twist, out):
     """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
     square = 0.0
     for k in range(4):
@@ -217,7 +217,7 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 
 @njit(cache=True)
-def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, twist):
+def _intended_plus_planned_motion_into(packed, start, moving, memory, time, pose, twist):
     intended_motion_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += moving[k]
@@ -225,11 +225,13 @@ def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, 
         add_planned_motion_into(memory, time, pose, twist)
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def _hand_wrench_at_time(
     packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
-    _intended_or_planned_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
+    _intended_plus_planned_motion_into(
+        packed, start, moving, memory, time, intent_pose, intent_twist
+    )
     hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
@@ -310,7 +312,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion() | {self.time_ticket()}
+        moving = self._declare_intended_motion_inputs() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task requires the arguments training, arm and tip")
@@ -319,7 +321,7 @@ class Operator(LeafSystem):
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
-    def _declare_intended_motion(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_inputs(self) -> set[DependencyTicket]:
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
         return {pose.ticket(), twist.ticket()}
@@ -377,20 +379,20 @@ class Operator(LeafSystem):
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
 
-    def _evaluate_intended_motion(self, context: Context) -> tuple[Array, ...]:
+    def _intent_segments_and_reference(self, context: Context) -> tuple[Array, ...]:
         if not self._intended_pose.HasValue(context):
             return self._intent
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not normalize_pose_into(pose, twist, self._commanded_pose):
+        if not check_motion_and_normalize_pose_into(pose, twist, self._commanded_pose):
             what = f"the intended motion at {context.get_time():g} s is not a finite pose and twist"
             remedy = "give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s"
             raise DrakeTeleopError(what, where="intended_pose", remedy=remedy)
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        intent = *self._evaluate_intended_motion(context), self._decision_memory(context)
+        intent = *self._intent_segments_and_reference(context), self._decision_memory(context)
         own = self._impedance, self._intent_pose, self._intent_twist
         stylus = self._pose.Eval(context), self._twist.Eval(context)
         wrench = output.get_mutable_value()
@@ -400,6 +402,6 @@ class Operator(LeafSystem):
         time = context.get_time()
         pose = output.get_mutable_value()
         memory = self._decision_memory(context)
-        _intended_or_planned_motion_into(
-            *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist
+        _intended_plus_planned_motion_into(
+            *self._intent_segments_and_reference(context), memory, time, pose, self._intent_twist
         )

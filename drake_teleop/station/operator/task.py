@@ -90,7 +90,7 @@ class Movement:
     gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 
 
-def check_distance(task: Task, where: str) -> None:
+def check_target_beyond_standoff(task: Task, where: str) -> None:
     """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.target_distance <= least:

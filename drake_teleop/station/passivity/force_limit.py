@@ -13,7 +13,11 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import none
-from drake_teleop.station.passivity.memory import LAST_WRENCH, MOTION_SCALE, own_parameters
+from drake_teleop.station.passivity.memory import (
+    LAST_PORT_WRENCH,
+    SLAVE_PER_MASTER_MOTION,
+    own_parameters,
+)
 from drake_teleop.station.passivity.packet import limit_group
 
 _HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
@@ -28,7 +32,7 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: Array) -> None:
-        p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
+        p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[SLAVE_PER_MASTER_MOTION])
 
 
 @njit(cache=True)
@@ -36,7 +40,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     SERVO_D,
     SERVO_K,
     own_memory,
@@ -88,7 +88,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] += p[_COUPLING_DAMPING][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, hand, packet)
 
 
@@ -103,5 +103,5 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         move_pose_into(received[POSE], shift, memory[COMMAND_POSE])
         copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

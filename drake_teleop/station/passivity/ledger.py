@@ -46,9 +46,9 @@ from drake_teleop.station.passivity.ledger_slave import (
 )
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
-    LAST_WRENCH,
-    MOTION_SCALE,
+    LAST_PORT_WRENCH,
     SENT_ENERGY,
+    SLAVE_PER_MASTER_MOTION,
     STORED_ENERGY,
     own_memory,
 )
@@ -162,10 +162,12 @@ class LedgerConfig:
             self.reserve,
             self.hand_reserve,
         )
-        p[DRAG_WRENCH] = np.divide(self.drag, p[MOTION_SCALE])
-        p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
-        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[MOTION_SCALE])
-        p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
+        p[DRAG_WRENCH] = np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION])
+        p[CONTACT_THRESHOLD] = np.divide(self.touch, p[SLAVE_PER_MASTER_MOTION])
+        p[ENCODER_STEP] = np.multiply(self.encoder_step or [0.0, 0.0], p[SLAVE_PER_MASTER_MOTION])
+        p[WRENCH_METRIC] = (
+            ANGLE_PER_LENGTH * p[SLAVE_PER_MASTER_MOTION] / p[SLAVE_PER_MASTER_MOTION][0]
+        ) ** 2
 
 
 def initialize(p: Array, memory: Array) -> None:
@@ -186,7 +188,7 @@ def max_slave_speed(config: LedgerConfig, mass: Array) -> Array:
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     velocity, offset_to_slave = memory[FILTERED_OWN_VELOCITY], wrench  # overwritten below
-    _remove_encoder_flicker(dx, p, memory)
+    _store_hand_step_without_flicker(dx, p, memory)
     steady = memory[_HAND_STEP_WITHOUT_FLICKER]
     for i in range(6):
         offset_to_slave[i] = steady[i] / T
@@ -224,7 +226,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             memory[SENT_ENERGY][g],
             memory[STORED_ENERGY][g],
         )
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
     for i in range(6):
         steady[i] = -memory[_LOST_HAND_MOTION][i]
@@ -233,7 +235,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _remove_encoder_flicker(dx, p, memory):
+def _store_hand_step_without_flicker(dx, p, memory):
     """Write the hand's displacement beyond the lost motion into memory (docs/theory.md, M2)."""
     lost, steady = memory[_LOST_HAND_MOTION], memory[_HAND_STEP_WITHOUT_FLICKER]
     for g in range(2):
@@ -248,7 +250,7 @@ def _remove_encoder_flicker(dx, p, memory):
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    work, ledger = dot_of_group(memory[LAST_WRENCH], dx, g), memory[STORED_ENERGY]
+    work, ledger = dot_of_group(memory[LAST_PORT_WRENCH], dx, g), memory[STORED_ENERGY]
     memory[_WORK_ON_HAND_SINCE_REST][g] = max(memory[_WORK_ON_HAND_SINCE_REST][g] + work, 0.0)
     if work < 0.0 and in_contact and ledger[g] > _HAND_INPUT_SENDING_LEVEL * p[MASTER_RESERVE][g]:
         memory[SENT_ENERGY][g] -= work
@@ -401,7 +403,10 @@ def _cross_fade_wrench(g, T, p, memory, wrench):
     last, fading = memory[_LAST_UNLIMITED_WRENCH], memory[_IS_WRENCH_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
-    size, most = length_of_group(wrench, g), MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
+    size, most = (
+        length_of_group(wrench, g),
+        MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g],
+    )
     if fading[g] > 0.0 and size > most:
         scale_group(wrench, g, most / size)
     else:

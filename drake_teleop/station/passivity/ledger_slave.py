@@ -20,7 +20,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     LOAD_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
@@ -34,13 +34,13 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
-    INTEGRAL,
+    METHOD_INTEGRAL,
     PACKET_LOAD_WRENCH,
     POSE,
     SECOND_ENERGY_COUNTER,
     VELOCITY,
     WRENCH,
-    credit_new_energy,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -88,10 +88,10 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
 PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, ROUND_TRIP = range(
-    INTEGRAL.start, INTEGRAL.start + 3
+    METHOD_INTEGRAL.start, METHOD_INTEGRAL.start + 3
 )
 PACKET_LEDGER_LEVEL = SECOND_ENERGY_COUNTER
-NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
+NEWEST_SLAVE_PACKET = METHOD_INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _layout = own_parameters()
@@ -178,7 +178,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 @njit(cache=True)
 def add_received_energy(g, received, memory):
     """Add newly received energy to this end's balance for group `g`; return it [J]."""
-    new = credit_new_energy(g, received, memory)
+    new = count_newly_received_energy(g, received, memory)
     memory[STORED_ENERGY][g] += new
     return new
 
@@ -207,7 +207,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _identify_contact(received, in_contact, dx, contact, T, p, memory)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         pose_difference_into(received[POSE], now, error)
@@ -240,7 +240,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
-    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_WRENCH], dx, g))
+    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[LAST_PORT_WRENCH], dx, g))
     new = add_received_energy(g, received, memory)
     ledger, input_energy = memory[STORED_ENERGY], memory[_ENERGY_IN_CONTACT]
     reserve = p[SLAVE_RESERVE][g]

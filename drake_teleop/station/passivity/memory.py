@@ -36,13 +36,13 @@ STORED_ENERGY = _layout.vector(2)  #: energy that this end may still release, by
 RECEIVED_ENERGY = _layout.vector(2)  #: energy from the other end that is credited here [J]
 SENT_ENERGY = _layout.vector(2)  #: this end's counter of sent energy [J]
 DISSIPATED_ENERGY = _layout.vector(2)  #: energy that the method removed from the loop here [J]
-LAST_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
+LAST_PORT_WRENCH = _layout.vector(6)  #: wrench at this port since the last step
 LOAD_WRENCH = _layout.vector(6)  #: part of the slave's wrench from its load's weight and inertia
 COMMAND = _layout.vector(13)  #: slave's command since the last step: pose X_WS, twist
 #: Remaining time in which the slave keeps its command while a new channel fills [s].
 CHANNEL_FILL_TIME_LEFT = _layout.number()
 FILTERED_HAND_VELOCITY = _layout.vector(6)  #: filtered twist at the master, see `retreat`
-LAST_HEALTHY_PACKET = _layout.vector(38)  #: last sent packet, see `packet`
+LAST_HEALTHY_SENT_PACKET = _layout.vector(38)  #: last sent packet, see `packet`
 _METHOD_MEMORY_SLICE = _layout.rest()
 _command_layout = SlotAllocator(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command_layout.vector(7), _command_layout.rest()
@@ -57,7 +57,7 @@ SERVO_D = _parameter_layout.vector(2)
 #: Mass of the slave at its tool, in the master's power units [kg, kg m^2].
 SLAVE_MASS = _parameter_layout.vector(2)
 #: Factors from the master's power units to the wrench at the hand, for force and torque.
-MOTION_SCALE = _parameter_layout.vector(2)
+SLAVE_PER_MASTER_MOTION = _parameter_layout.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
 #: [m/s, rad/s].
 RETREAT_SPEED = _parameter_layout.vector(2)

@@ -15,8 +15,8 @@ from numba import types
 
 from drake_teleop.common.compiled import address_of_function, make_call_at_address, njit
 from drake_teleop.common.config import (
+    check_all_field_values,
     check_field_name,
-    check_ranges,
     choice,
     plain,
     quantity,
@@ -45,14 +45,14 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    LAST_HEALTHY_PACKET,
+    LAST_HEALTHY_SENT_PACKET,
     MEMORY_SIZE,
-    MOTION_SCALE,
     NUM_PARAMETERS,
     RETREAT_SPEED,
     SERVO_D,
     SERVO_K,
     SLAVE_MASS,
+    SLAVE_PER_MASTER_MOTION,
     STEP_COUNT,
     WRENCH_LIMIT,
 )
@@ -237,7 +237,7 @@ class PassivityConfig(MethodConfigs, _CommonMethodConfig):
             check_field_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():
             config = schema(**self.registered)
-        check_ranges(config, f"{where}.registered")
+        check_all_field_values(config, f"{where}.registered")
         return config
 
 
@@ -258,7 +258,7 @@ def method_parameters(
     p[SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
     p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
     p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
-    p[MOTION_SCALE] = motion_scale
+    p[SLAVE_PER_MASTER_MOTION] = motion_scale
     p[RETREAT_SPEED] = (
         np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
     )
@@ -276,7 +276,7 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY_SIZE)
     memory[COMMAND_POSE] = pose
-    memory[LAST_HEALTHY_PACKET][POSE] = pose
+    memory[LAST_HEALTHY_SENT_PACKET][POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -320,9 +320,9 @@ def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, int, int]:
 def _set_packet_number_and_health(healthy, memory, packet):
     if healthy:
         packet[SENDER_INPUTS_FINITE] = 1.0
-        copy_into(memory, LAST_HEALTHY_PACKET.start, packet, 0, PACKET_SIZE)
+        copy_into(memory, LAST_HEALTHY_SENT_PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, LAST_HEALTHY_PACKET.start, PACKET_SIZE)
+        copy_into(packet, 0, memory, LAST_HEALTHY_SENT_PACKET.start, PACKET_SIZE)
         packet[SENDER_INPUTS_FINITE] = 0.0
     packet[PACKET_NUMBER] = memory[STEP_COUNT]
     memory[STEP_COUNT] += 1.0

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, LAST_WRENCH
+from drake_teleop.station.passivity.memory import (
+    COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
+    LAST_PORT_WRENCH,
+)
 from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
@@ -22,7 +27,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         wrench[i] = requested[i]
     for g in range(2):
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -32,5 +37,5 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         copy_into(memory, COMMAND_POSE.start, received, POSE.start, 7)
         copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

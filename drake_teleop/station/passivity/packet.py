@@ -30,7 +30,7 @@ VELOCITY = _layout.vector(6)
 #: Wrench at the sender [f; tau], in W, in the master's power units.
 WRENCH = _layout.vector(6)
 #: Cumulative integral; the method defines it.
-INTEGRAL = _layout.vector(6)
+METHOD_INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
 CUMULATIVE_ENERGY = _layout.vector(2)
 #: Second energy counter, by group [J].
@@ -53,7 +53,7 @@ def has_arrived(received):
 
 
 @njit(cache=True)
-def credit_new_energy(g, received, memory):
+def count_newly_received_energy(g, received, memory):
     """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
     new = max(received[CUMULATIVE_ENERGY][g] - memory[RECEIVED_ENERGY][g], 0.0)
     memory[RECEIVED_ENERGY][g] += new

@@ -18,7 +18,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
@@ -31,7 +31,7 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    credit_new_energy,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -83,10 +83,10 @@ def initialize(p, memory):
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
-    damped = -dot_of_group(memory[LAST_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
+    damped = -dot_of_group(memory[LAST_PORT_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
     ledger = memory[STORED_ENERGY]
     energy = ledger[g] + damped
-    energy += credit_new_energy(g, received, memory)
+    energy += count_newly_received_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
     share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):
@@ -117,14 +117,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit_group(wrench, g, limits[g])
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
-    now, held, K, D = memory[COMMAND_POSE], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
+    now, held, K, D = memory[COMMAND_POSE], memory[LAST_PORT_WRENCH], p[SERVO_K], p[SERVO_D]
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
@@ -142,7 +142,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    offset, other, held = memory[_SPRING_DEFLECTION], np.empty(6), memory[LAST_WRENCH]
+    offset, other, held = memory[_SPRING_DEFLECTION], np.empty(6), memory[LAST_PORT_WRENCH]
     K, D = p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, offset)
     pose_difference_into(requested, pose, other)

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     FILTERED_HAND_VELOCITY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     RETREAT_SPEED,
     SLAVE_MASS,
     SlotAllocator,
@@ -159,4 +159,4 @@ def fade_retreat_wrench(twist, T, p, memory, wrench):
             slowing = (along - dot_of_group(wrench, twist, g) / size) / _HAND_VELOCITY_FILTER_S
             share = max(2.0 - along / p[RETREAT_SPEED][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)

@@ -19,12 +19,12 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
-    MOTION_SCALE,
+    LAST_PORT_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
+    SLAVE_PER_MASTER_MOTION,
     STEP_COUNT,
     STORED_ENERGY,
     own_memory,
@@ -32,13 +32,13 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
-    INTEGRAL,
     MAX_HAND_WRENCH_RATE,
+    METHOD_INTEGRAL,
     PACKET_NUMBER,
     POSE,
     SECOND_ENERGY_COUNTER,
     WRENCH,
-    credit_new_energy,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -61,7 +61,7 @@ _STIFFNESS_AVERAGING_TRAVEL = (1e-3, 1e-2)
 _FULL_DRAG_HAND_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = INTEGRAL.start, SECOND_ENERGY_COUNTER
+_NEWEST_MASTER_PACKET, _PACKET_SLAVE_ENERGY = METHOD_INTEGRAL.start, SECOND_ENERGY_COUNTER
 
 # Parameters; reserve, drag and stiffness in the master's power units.
 _layout = own_parameters()
@@ -131,8 +131,11 @@ class TdpaConfig:
     def pack_into(self, p: Array) -> None:
         p[_WRENCH_RELEASE_TIME], p[_LEDGER_DRAIN_RATE] = self.release, self.drain_rate
         p[_COMMAND_DRIFT_RATE], p[_MAX_COMMAND_SPEED] = self.drift_rate, self.speed
-        p[_TARGET_RESERVE], p[_DRAG_WRENCH] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
-        p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
+        p[_TARGET_RESERVE], p[_DRAG_WRENCH] = (
+            self.reserve,
+            np.divide(self.drag, p[SLAVE_PER_MASTER_MOTION]),
+        )
+        p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[SLAVE_PER_MASTER_MOTION]))
 
 
 def charged_tdpa_config() -> TdpaConfig:
@@ -143,7 +146,7 @@ def charged_tdpa_config() -> TdpaConfig:
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     for g in range(2):
-        memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
+        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     drain = min(T * p[_LEDGER_DRAIN_RATE], 1.0)
     release = T / p[_WRENCH_RELEASE_TIME] if p[_WRENCH_RELEASE_TIME] > 0.0 else 1.0
     requested = received[WRENCH]
@@ -161,7 +164,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
             share = _permitted_wrench_share(
-                g, drained, drain, stored, share, T, p, memory[LAST_WRENCH], wrench
+                g, drained, drain, stored, share, T, p, memory[LAST_PORT_WRENCH], wrench
             )
         withheld[g] = 1.0 - share
         memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
@@ -171,7 +174,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if p[_DRAG_WRENCH][g] > 0.0:
             _send_surplus_energy(g, p, memory)
         packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
 
@@ -179,7 +182,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench):
     least, size = (
-        length_of_group(held, g) - MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
+        length_of_group(held, g) - MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g],
         length_of_group(wrench, g),
     )
     share = min(share, max(drain * stored / drained, least / size))
@@ -220,7 +223,7 @@ def _charge_hand_work_to_ledger(g, drained, p, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     for g in range(2):
-        memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
+        memory[STORED_ENERGY][g] += count_newly_received_energy(g, received, memory)
     copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot_of_group(wrench, dx, g)
@@ -238,7 +241,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         packet[_PACKET_SLAVE_ENERGY][g] = memory[STORED_ENERGY][g]
         _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, memory[_FILTERED_SLAVE_WRENCH], packet)
 
 
@@ -274,7 +277,7 @@ def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
 def _estimate_contact_stiffness(g, dx, wrench, T, memory):
     size, stiffness = length_of_group(dx, g), memory[_CONTACT_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_AVERAGING_TRAVEL[g] * T:
-        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[LAST_WRENCH], dx, g)
+        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[LAST_PORT_WRENCH], dx, g)
         forget = min(size / _STIFFNESS_AVERAGING_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
@@ -318,7 +321,7 @@ def _add_command_work(command, sign, memory):
     step = np.empty(6)
     pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
-        work = sign * dot_of_group(memory[LAST_WRENCH], step, g)
+        work = sign * dot_of_group(memory[LAST_PORT_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
         memory[_COMMAND_WORK_IN][g] += into
         memory[_COMMAND_WORK_OUT][g] += into - work

@@ -15,7 +15,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
+    LAST_PORT_WRENCH,
     SENT_ENERGY,
     SERVO_D,
     SERVO_K,
@@ -29,7 +29,7 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    credit_new_energy,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -100,10 +100,10 @@ def initialize(p, memory):
 @njit(cache=True)
 def _exchange_tank_energy(received, dx, T, p, memory, packet):
     ledger, sent_so_far = memory[STORED_ENERGY], memory[SENT_ENERGY]
-    held, capacity = memory[LAST_WRENCH], p[_TANK_CAPACITY]
+    held, capacity = memory[LAST_PORT_WRENCH], p[_TANK_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
-        level += credit_new_energy(g, received, memory)
+        level += count_newly_received_energy(g, received, memory)
         sent = min(T * p[_SEND_RATE], 1.0) * max(level - _TANK_RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
@@ -139,7 +139,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if drained > drainable:
             scale_group(wrench, g, drainable / drained)
         _limit_wrench_to_tank(wrench, dx, g, p[MAX_PORT_ACCELERATION][g], T, memory)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -151,7 +151,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if has_arrived(received):
         target = received[POSE]
     pose_difference_into(target, pose, spring)
-    motor_wrench, K, D = memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
+    motor_wrench, K, D = memory[LAST_PORT_WRENCH], p[SERVO_K], p[SERVO_D]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             spring[i] *= K[g]
@@ -181,7 +181,12 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held, K, D = memory[_SERVO_SPRING_WRENCH], memory[LAST_WRENCH], p[SERVO_K], p[SERVO_D]
+    spring, held, K, D = (
+        memory[_SERVO_SPRING_WRENCH],
+        memory[LAST_PORT_WRENCH],
+        p[SERVO_K],
+        p[SERVO_D],
+    )
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

@@ -18,21 +18,21 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    LAST_WRENCH,
-    MOTION_SCALE,
+    LAST_PORT_WRENCH,
     RECEIVED_ENERGY,
     SENT_ENERGY,
+    SLAVE_PER_MASTER_MOTION,
     STORED_ENERGY,
     own_memory,
     own_parameters,
 )
 from drake_teleop.station.passivity.packet import (
     CUMULATIVE_ENERGY,
-    INTEGRAL,
     MAX_HAND_WRENCH_RATE,
+    METHOD_INTEGRAL,
     PACKET_NUMBER,
     POSE,
-    credit_new_energy,
+    count_newly_received_energy,
     dot_of_group,
     fill_packet,
     has_arrived,
@@ -92,9 +92,9 @@ class WaveConfig:
 @njit(cache=True)
 def _filter_received_wave(received, T, p, memory, wave):
     ledger, played = memory[STORED_ENERGY], memory[_FILTERED_WAVE_INTEGRAL]
-    integral = received[INTEGRAL]
+    integral = received[METHOD_INTEGRAL]
     for g in range(2):
-        ledger[g] += credit_new_energy(g, received, memory)
+        ledger[g] += count_newly_received_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
         left, store = dot_of_group(wave, wave, g), 2.0 * T * ledger[g]
@@ -109,7 +109,11 @@ def _filter_received_wave(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    wave, integral, sent = memory[_FILTERED_WAVE], memory[_SENT_WAVE_INTEGRAL], packet[INTEGRAL]
+    wave, integral, sent = (
+        memory[_FILTERED_WAVE],
+        memory[_SENT_WAVE_INTEGRAL],
+        packet[METHOD_INTEGRAL],
+    )
     _filter_received_wave(received, T, p, memory, wave)
     catching_up, newest = memory[_IS_WRENCH_CATCHING_UP], received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET_NUMBER] + 1.0:
@@ -125,15 +129,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
-            most = MAX_HAND_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
-            if _limit_wrench_change(g, energy, dx, most, memory[LAST_WRENCH], wrench):
+            most = MAX_HAND_WRENCH_RATE[g] * T / p[SLAVE_PER_MASTER_MOTION][g]
+            if _limit_wrench_change(g, energy, dx, most, memory[LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot_of_group(wrench, dx, g)
         memory[SENT_ENERGY][g] += max(left, 0.0)
         packet[CUMULATIVE_ENERGY][g] = memory[SENT_ENERGY][g]
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -171,10 +175,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     else:
         step[:] = 0.0
         _reflect_wave_at_held_command(wrench, T, p, memory)
-    copy_into(packet, INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
+    copy_into(packet, METHOD_INTEGRAL.start, memory, _SENT_WAVE_INTEGRAL.start, 6)
     copy_into(packet, CUMULATIVE_ENERGY.start, memory, SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, COMMAND.start, 13)
-    copy_into(memory, LAST_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, LAST_PORT_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -222,7 +226,7 @@ def _reflect_wave_while_channel_fills(received, wrench, T, p, memory):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
-            played[i] = received[INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
+            played[i] = received[METHOD_INTEGRAL][i] - p[_WAVE_FILTER_TIME] * wave[i]
         memory[SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
         ledger[g] = 0.5 * (T + p[_WAVE_FILTER_TIME]) * dot_of_group(wave, wave, g)
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -20,10 +20,10 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.compensation import (
-    add_weight_into,
+    add_excess_weight_into,
     scaled_wrench_into,
     scales_from_eta,
-    weight_and_inertia_scales,
+    weight_scales_and_inertia_scales,
 )
 from drake_teleop.load.regressor import (
     FIRST_JOINT_INDEX,
@@ -38,7 +38,11 @@ from drake_teleop.load.regressor import (
     non_contact_wrench_into,
     sample_size,
 )
-from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, sensor_acceleration_into
+from drake_teleop.station.slave.arm import (
+    ArmModel,
+    acceleration_from_specific_force_into,
+    forward_kinematics,
+)
 
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
 _CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
@@ -107,7 +111,7 @@ class ForceScalingConfig:
             )
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
-            weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)
+            weights, inertias = weight_scales_and_inertia_scales(self.sigma, self.sigma, *separate)
             return Scales(*inertias, self.gamma, *weights)
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
@@ -182,10 +186,10 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
         gravity = np.empty(3)
-        sensor_acceleration_into(
+        acceleration_from_specific_force_into(
             arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity
         )
-        add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
+        add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
 @njit(cache=True)
@@ -196,16 +200,16 @@ def find_sample_fault(sample, estimate, time, valid_range):
     """
     if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and all_in_range(
+    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and are_finite_and_in_range(
         sample[SAMPLE_MOTION]
     )
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _BAD_READING_FAULT
-    if not all_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
+    if not are_finite_and_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
         return _BAD_JOINTS_FAULT
-    return _NO_FAULT if all_in_range(estimate) else _BAD_LOAD_FAULT
+    return _NO_FAULT if are_finite_and_in_range(estimate) else _BAD_LOAD_FAULT
 
 
 @njit(cache=True)
@@ -215,8 +219,10 @@ def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, ou
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
 
 
-@njit(cache=True, borrows=True)
-def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
+@njit(cache=True, omits_reference_counting=True)
+def _scaled_contact_and_fault_into(
+    sample, estimate, gripper, change, time, arm, elimination, valid_range, out
+):
     _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
     _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
     out[12] = find_sample_fault(sample, estimate, time, valid_range)
@@ -300,7 +306,10 @@ class ForceScaling(LeafSystem):
             self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
         self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
         self.DeclareVectorOutputPort(
-            "scaled_contact_and_fault", 13, weak_callback(self._calc_log_row), inputs
+            "scaled_contact_and_fault",
+            13,
+            weak_callback(self._calc_scaled_contact_and_fault),
+            inputs,
         )
 
     def SetScales(
@@ -337,10 +346,10 @@ class ForceScaling(LeafSystem):
             *self._evaluate_inputs(context), self._arm, output.get_mutable_value()
         )
 
-    def _calc_log_row(self, context: Context, output: BasicVector) -> None:
+    def _calc_scaled_contact_and_fault(self, context: Context, output: BasicVector) -> None:
         inputs = self._evaluate_inputs(context)
         constants = self._arm, _CONTACT_ONLY_SCALES, self._valid_range
-        _log_row_into(*inputs, *constants, output.get_mutable_value())
+        _scaled_contact_and_fault_into(*inputs, *constants, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         sample, estimate, _, _, time = self._evaluate_inputs(context)

@@ -50,8 +50,8 @@ class JointCoupling(LeafSystem):
             ("pose_command", 7, self._calc_pose),
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), sources)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_held_joints_and_clutch)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update_held_joints_and_clutch)
 
     def _commanded_joint_positions(self, context: Context) -> Array:
         """Return the leader's positions plus the offset, or the held command (n,) [rad]."""
@@ -69,7 +69,9 @@ class JointCoupling(LeafSystem):
             output.get_mutable_value(),
         )
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_held_joints_and_clutch(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
         memory = discrete_state.get_mutable_value(0)
         memory[:-1] = self._commanded_joint_positions(context)
         memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5

@@ -70,7 +70,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         out[4 + k] = command[4 + k] + translation_scale * offset[k]
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def _pose_command_into(pose, references, alignment, translation_scale, rotation_scale, out):
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
@@ -113,9 +113,9 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
         sources = {self._pose.ticket(), self.xd_ticket()}
         self.DeclareVectorOutputPort("pose_command", 7, weak_callback(self._calc_command), sources)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_clutch_references)
         # The command follows from the first sample on.
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update_clutch_references)
 
     def OpenClutch(self, context: Context, command: Array) -> None:
         """Open the clutch; the slave's commanded pose X_WS stays at `command` (7,)."""
@@ -127,7 +127,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
         _pose_command_into(pose, references, *self._scaling, output.get_mutable_value())
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_clutch_references(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
         engage = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
         if engage == (references[14] > 0.5):

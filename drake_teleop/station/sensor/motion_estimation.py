@@ -69,7 +69,7 @@ _NUM_ANGLE_SECTIONS = 4
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_FLAGGED_SAMPLES_LEFT = 1
+_FLAGGED_SAMPLES_LEFT_INDEX = 1
 _ANGULAR_FUSION_FILTER_START = 2
 _FUSION_FILTER_SIZE = 24
 _LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_SIZE
@@ -154,7 +154,10 @@ def fusion_gains(
 ) -> tuple[Array, Array]:
     """Return the Kalman gains of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
-    angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
+    angle_std, drift = (
+        _sensor_rotation_std_by_encoders(sensor, num_joints),
+        config.angular_acceleration_drift,
+    )
     return (
         steady_state_kalman_gains(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_gains(
@@ -179,11 +182,11 @@ def estimated_motion_std(
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
-    alpha = _encoder_angle_std(sensor, num_joints) * np.sqrt(power)
+    alpha = _sensor_rotation_std_by_encoders(sensor, num_joints) * np.sqrt(power)
     return np.repeat([alpha * _SENSOR_RMS_LEVER_M_PER_RAD, 0.0, alpha], 3)
 
 
-def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
+def _sensor_rotation_std_by_encoders(sensor: WristSensorConfig, num_joints: int) -> float:
     """Return the standard deviation [rad] of the rotation of S by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
@@ -269,7 +272,9 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     if constants.encoders_only != 0.0:
         copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        _convert_accelerometer(constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample)
+        _convert_and_fuse_accelerometer(
+            constants, memory, arm[n, LAST_ROW_GRAVITY_COLUMN:], motion, sample
+        )
     memory[0] += 1.0
 
 
@@ -283,7 +288,7 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
     _align_signal_paths(constants, memory, n, reading, sample)
     copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
-    _convert_accelerometer(constants, memory, motion[:3], motion, sample)
+    _convert_and_fuse_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
@@ -318,9 +323,11 @@ def _align_signal_paths(constants, memory, n, reading, sample):
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT] - 1.0
-    memory[_FLAGGED_SAMPLES_LEFT] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT] > 0.0 else 0.0
+    flagged = (
+        float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
+    )
+    memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAGGED_SAMPLES_LEFT_INDEX] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -335,7 +342,7 @@ def _differentiate_joint_angles(constants, joints, angles):
 
 
 @njit(cache=True)
-def _convert_accelerometer(constants, memory, gravity, motion, sample):
+def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants.period, constants.fused != 0.0, memory[0] == 0.0
     s, omega = sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY]
     alpha = sample[SAMPLE_ANGULAR_ACCELERATION]

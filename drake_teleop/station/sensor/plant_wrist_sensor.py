@@ -49,7 +49,7 @@ from drake_teleop.load.regressor import (
     SAMPLE_WRENCH_AND_MOTION,
     SATURATION_FLAG_INDEX,
     sample_size,
-    signals_of_sample,
+    signal_sizes_of_sample,
 )
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -78,7 +78,7 @@ _SENSOR_POSITION_IN_BODY, _SENSOR_ORIENTATION_IN_BODY = 0, 3
 _WELD_ORIENTATION_IN_SENSOR, _WELD_POSITION_IN_SENSOR = 12, 21
 _GRAVITY_IN_WORLD, _REACTION_WRENCH_SIGN = 24, 27
 # Configuration: R_WB, angular velocity of B in W, joint positions.
-_BODY_MOTION_SIZE = 12
+_BODY_ROTATION_AND_RATE_SIZE = 12
 
 
 def AddWristSensor(
@@ -181,7 +181,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         )
         sample = np.zeros(sample_size(n) + 1)
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
-        held = np.full(_BODY_MOTION_SIZE + n, np.nan)
+        held = np.full(_BODY_ROTATION_AND_RATE_SIZE + n, np.nan)
         ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
         self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
         self._sensor = (constants, motion, ends[2] - ends[1], config.ideal)
@@ -203,9 +203,9 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._store_configuration)
+            self.DeclareInitializationDiscreteUpdateEvent(self._store_body_rotation_rate_and_joints)
         first = 0
-        for name, size in {**signals_of_sample(n), "sample_time": 1}.items():
+        for name, size in {**signal_sizes_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
             first += size
         self._declare_output("sample", 0, first)
@@ -223,23 +223,29 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
         self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
 
-    def _evaluate_configuration(self, context: Context) -> Array:
+    def _body_rotation_rate_and_joint_positions(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _store_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.get_mutable_value(0)[self._held] = self._evaluate_configuration(context)
+    def _store_body_rotation_rate_and_joints(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
+        discrete_state.get_mutable_value(0)[self._held] = (
+            self._body_rotation_rate_and_joint_positions(context)
+        )
 
     def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
         held = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._store_configuration(context, discrete_state)
+            self._store_body_rotation_rate_and_joints(context, discrete_state)
         if step % self._steps_per_sample == 0:
-            configuration = held if self._pairs_steps else self._evaluate_configuration(context)
+            configuration = (
+                held if self._pairs_steps else self._body_rotation_rate_and_joint_positions(context)
+            )
             memory = discrete_state.get_mutable_value(0)
             self._take_sample(context, configuration, memory)
 
@@ -276,8 +282,8 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
         truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
         truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
         truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
-    n = configuration.shape[0] - _BODY_MOTION_SIZE
-    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_MOTION_SIZE, n)
+    n = configuration.shape[0] - _BODY_ROTATION_AND_RATE_SIZE
+    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_ROTATION_AND_RATE_SIZE, n)
 
 
 @njit(cache=True)

@@ -71,12 +71,12 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
     assemble_plant_state,
-    environment_wrench,
-    plant_rates,
-    plant_rates_under_wrench,
+    contact_and_plant_rates_into,
+    environment_wrench_about_Wo_into,
+    plant_rates_under_wrench_into,
     tool_proximity,
 )
-from drake_teleop.station.wiring import connect_inputs
+from drake_teleop.station.wiring import connect_matching_inputs
 
 #: Tolerance of equal instants, in periods.
 _EQUAL_TIME_TOLERANCE_PERIODS = 1e-6
@@ -168,7 +168,7 @@ def append_step_to_queue(tail, time, state, around):
     tail[1] += 1.0
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def _try_queue_step(memory, tail, longest, time, state, around):
     if memory[tail + 1] >= longest:
         return False
@@ -183,7 +183,7 @@ def _extrapolate_torque_into(held, after, torque):
         torque[i] += after * held[1][i]
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def take_due_samples(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
@@ -192,7 +192,7 @@ def take_due_samples(
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
-            damping, gravity; `MakeJointTable` of other moving bodies, wrenches from Drake).
+            damping, gravity; joint table of other moving bodies; wrenches from Drake).
         sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
             and of `tail`, ideal).
         time: present time [s], the end of a step.
@@ -224,13 +224,13 @@ def take_due_samples(
     _extrapolate_torque_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
-        environment_wrench(
+        environment_wrench_about_Wo_into(
             physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
         )
         now_wrench_W += touching_W
-        plant_rates_under_wrench(physics, now, tau, applied_W, now_wrench_W, now_dot)
+        plant_rates_under_wrench_into(physics, now, tau, applied_W, now_wrench_W, now_dot)
     else:
-        plant_rates(physics, now, tau, applied_W, now_wrench_W, now_dot)
+        contact_and_plant_rates_into(physics, now, tau, applied_W, now_wrench_W, now_dot)
     for k in range(queued):
         start = tail[2 + k * width :][:width]
         until, end, end_dot = time, now, now_dot
@@ -240,10 +240,10 @@ def take_due_samples(
         if (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period >= until:
             continue
         _extrapolate_torque_into(held, start[0] - time, tau)
-        plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
+        contact_and_plant_rates_into(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
             _extrapolate_torque_into(held, until - time, tau)
-            plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
+            contact_and_plant_rates_into(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _EQUAL_TIME_TOLERANCE_PERIODS) * period < until:
             u = (count * period - start[0]) / h
@@ -252,7 +252,7 @@ def take_due_samples(
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
             _extrapolate_torque_into(held, count * period - time, tau)
-            plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
+            contact_and_plant_rates_into(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
@@ -375,11 +375,11 @@ class WristSensor(LeafSystem):
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
         self.DeclarePeriodicPublishEvent(
-            _ACCELERATION_CHECK_PERIOD_S, 0.0, self._check_acceleration
+            _ACCELERATION_CHECK_PERIOD_S, 0.0, self._check_acceleration_for_unknown_forces
         )
 
     @property
-    def motion_dependent_indices(self) -> NDArray[np.intp]:
+    def motion_dependent_state_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
         size = regressor.sample_size(self._n)
@@ -473,7 +473,9 @@ class WristSensor(LeafSystem):
             told[1 + k, :6] = self._twin().wrench_W(asked[:own], asked[own:])
 
     def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
+        if self._max_queued_steps > 1 and not self._is_torque_or_noise_update_time(
+            context.get_time()
+        ):
             seen = self._arm_state_and_surroundings(context)
             if not self._watched.size or self._tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
@@ -481,14 +483,14 @@ class WristSensor(LeafSystem):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
-    def _are_samples_due(self, time: float) -> bool:
+    def _is_torque_or_noise_update_time(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
         margin, (held, block) = _EQUAL_TIME_TOLERANCE_PERIODS * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
 
-    def _check_acceleration(self, context: Context) -> EventStatus:
+    def _check_acceleration_for_unknown_forces(self, context: Context) -> EventStatus:
         n = self._n
         state, around = self._arm_state_and_surroundings(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
@@ -501,7 +503,7 @@ class WristSensor(LeafSystem):
         if self.reason_beyond_contact_law or near == PROXIMITY_NEAR_MONITORED:
             applied = applied + self._plant_contact_wrench_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
-        plant_rates(physics, x, torque, applied, np.empty(6), xdot)
+        contact_and_plant_rates_into(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
         error, size = np.abs(xdot[n + 1 : -1] - vdot).max(), np.abs(vdot).max()
         if not error < _ACCELERATION_CHECK_TOLERANCE * (1.0 + size):
@@ -540,14 +542,14 @@ def AddCompiledWristSensor(
     """
     sensor = WristSensor(slave, config, motion, period, held, ramps="torque_rate" in torque)
     builder.AddNamedSystem("wrist_sensor", sensor)
-    connect_inputs(builder, sensor, slave.ports)
-    connect_inputs(builder, sensor, torque)
+    connect_matching_inputs(builder, sensor, slave.ports)
+    connect_matching_inputs(builder, sensor, torque)
     if not config.ideal:
         block_s = SAMPLES_PER_NOISE_BLOCK * period
         noise = RandomSource(RandomDistribution.kGaussian, NOISE_BLOCK_SIZE, block_s)
         builder.AddNamedSystem("wrist_sensor_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    parts = regressor.signals_of_sample(slave.arm.num_joints)
+    parts = regressor.signal_sizes_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)

@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import quaternions_from_matrices
 from drake_teleop.common.vectors import (
     add_cross_product,
-    add_into,
+    add_vector_into,
     apply_matrix,
     cross,
     dot,
@@ -119,7 +119,7 @@ def _advance_pose_over_joint(
         p_PL_P = plus(p_PL_P, scale_vector(q, (joint[2], joint[5], joint[8])))
         q = 0.0
     p_PL_W = apply_matrix(matrix_at(x, 12), p_PL_P)
-    add_into(x, 9, p_PL_W)
+    add_vector_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
     R_JP = transposed(matrix_at(joint, ROTATION_COLUMN))
@@ -135,24 +135,24 @@ def _advance_motion_over_joint(
 ) -> None:
     r = _advance_pose_over_joint(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
-    add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
+    add_vector_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
     if table[row, IS_PRISMATIC_COLUMN] != 0.0:
-        add_into(x, 0, plus(scale_vector(qdd, z), scale_vector(2.0 * qd, cross(omega, z))))
+        add_vector_into(x, 0, plus(scale_vector(qdd, z), scale_vector(2.0 * qd, cross(omega, z))))
     else:
-        add_into(x, 3, scale_vector(qd, z))
-        add_into(x, 6, plus(scale_vector(qdd, z), scale_vector(qd, cross(omega, z))))
+        add_vector_into(x, 3, scale_vector(qd, z))
+        add_vector_into(x, 6, plus(scale_vector(qdd, z), scale_vector(qd, cross(omega, z))))
 
 
-def sensor_accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
+def accelerations_from_specific_forces(arm: ArmModel, q: Array, s: Array) -> Array:
     """Return accelerations s + g (N, 3) of So from specific forces s (N, 3), in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
-        sensor_acceleration_into(arm.table, q[k], s[k], out[k])
+        acceleration_from_specific_force_into(arm.table, q[k], s[k], out[k])
     return out
 
 
 @njit(cache=True)
-def sensor_acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
+def acceleration_from_specific_force_into(table: Array, q: Array, s: Array, out: Array) -> None:
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN : LAST_ROW_GRAVITY_COLUMN + 3]
@@ -239,7 +239,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 
 @njit(cache=True, inline="always")
-def _write_joint_axis_and_link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
+def _write_joint_axis_and_inertial_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
@@ -291,7 +291,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
             _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], x)
         else:
             _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
-        _write_joint_axis_and_link_wrench(table, row, x, link)
+        _write_joint_axis_and_inertial_wrench(table, row, x, link)
     _project_wrenches_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR_COLUMN] * vdot[row] + table[row, DAMPING_COLUMN] * v[row]
@@ -310,7 +310,7 @@ def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Arr
     h = apply_matrix(matrix_at(x, 12), vector_at(phi, 1))
     m, about_Lo = phi[0], symmetric_matrix_at(phi, 4)
     inertia[0] += m
-    add_into(inertia, 1, plus(h, scale_vector(m, p)))
+    add_vector_into(inertia, 1, plus(h, scale_vector(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
     diagonal = 2.0 * dot(p, h) + m * dot(p, p)
     k = 4
@@ -326,7 +326,7 @@ def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Arr
 
 
 @njit(cache=True)
-def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
+def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array) -> None:
     """Write the lower half of the mass matrix to M (n, n) and overwrite `link`.
 
     Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
@@ -395,7 +395,7 @@ def forward_dynamics(
             _advance_motion_over_joint(table, row, q[row], v[row], 0.0, x)
         else:
             _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
-        _write_joint_axis_and_link_wrench(table, row, x, link)
+        _write_joint_axis_and_inertial_wrench(table, row, x, link)
         _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
@@ -404,7 +404,7 @@ def forward_dynamics(
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING_COLUMN] * v[row]
         if table[row, DRY_FRICTION_COLUMN] != 0.0:
             vdot_out[row] += dry_friction(table[row, DRY_FRICTION_COLUMN], v[row])
-    _mass_matrix(table, link, inertia, M)
+    _lower_mass_matrix_into(table, link, inertia, M)
     solve_positive_definite(M, vdot_out)
 
 

@@ -39,7 +39,7 @@ from drake_teleop.station.slave.arm import (
 _DEFAULT_SPEED_LIMIT_RAD_S = np.pi
 _DEFAULT_JOINT_HALF_RANGE_M, _DEFAULT_SPEED_LIMIT_M_S = 1.0, 1.0  # of a prismatic joint
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
-_MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
+_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
 _MAX_PLAUSIBLE_JOINT_LIMIT_RAD_OR_M = 1e4
 # Default time to full speed [s].
@@ -238,7 +238,7 @@ def fill_missing_joint_limits(
         "effort_limit": effort,
     }
     completed = replace(arm, lower=lower, upper=upper, **limits)
-    plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_RANGE_RAD)
+    plausible = slides | unlimited | (upper - lower < _MIN_RANGE_SUSPECTED_IN_DEGREES_RAD)
     acceleration_text = (
         f"acceleration limits that reach full speed in {_DEFAULT_TIME_TO_SPEED_LIMIT_S:g} s{hint}"
     )
@@ -252,7 +252,11 @@ def fill_missing_joint_limits(
         ),
         (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
-        (~plausible, f"limits in rad, though more than {_MAX_PLAUSIBLE_RANGE_RAD:.4g} apart,", ""),
+        (
+            ~plausible,
+            f"limits in rad, though more than {_MIN_RANGE_SUSPECTED_IN_DEGREES_RAD:.4g} apart,",
+            "",
+        ),
     ):
         for text, kind in ((revolute_text, ~slides), (prismatic_text, slides)):
             assumed = missing & kind

@@ -19,7 +19,7 @@ SCENE_ERROR_TEXTS: ModelErrorTexts = ("scene", "its package:// addresses in fold
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
 _PLACE_IN_REPAIRED_TEXT_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
+_NUM_ERROR_LINE_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 
 
 @contextmanager
@@ -43,7 +43,9 @@ def translate_drake_errors(
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
-        room = MAX_ERROR_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_SEPARATOR_CHARS
+        room = (
+            MAX_ERROR_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_ERROR_LINE_SEPARATOR_CHARS
+        )
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None

@@ -71,7 +71,7 @@ def find_start_posture(slave: Slave, arm: ArmModel) -> Array:
     return q
 
 
-def check_holding_torque(arm: ArmModel, q: Array) -> None:
+def check_inertia_and_holding_torque(arm: ArmModel, q: Array) -> None:
     """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_MASS_MATRIX_EIGENVALUE_KG_M2:
         what = "the mass matrix is singular: the links have too little inertia"

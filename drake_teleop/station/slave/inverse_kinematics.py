@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
@@ -65,7 +65,9 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _all_solutions_into(R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array) -> int:
+def _ik_status_and_all_solutions_into(
+    R: Array, p: Array, q1_kept: float, q4_kept: float, q: Array
+) -> int:
     """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
@@ -150,10 +152,10 @@ def _nearest_branch_into(
         return _BAD_POSE
     for i in range(6):
         q[i] = min(max(reference[i], lower[i]), upper[i])
-    if not (np.isfinite(R.sum()) and all_in_range(p)):
+    if not (np.isfinite(R.sum()) and are_finite_and_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _all_solutions_into(R, p, reference[0], reference[3], branches)
+    status = _ik_status_and_all_solutions_into(R, p, reference[0], reference[3], branches)
     best = -1
     best_distance = np.inf
     for row in range(8):

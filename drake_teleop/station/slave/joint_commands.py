@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
@@ -72,7 +72,7 @@ class LeaderJointFollower(LeafSystem):
 
     def _next_command(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
-        if not all_in_range(leader):
+        if not are_finite_and_in_range(leader):
             return last, IkStatus.BAD_POSE
         within = np.clip(leader, self._lower, self._upper)
         status = IkStatus.OK if (within == leader).all() else IkStatus.JOINT_LIMIT
@@ -116,9 +116,13 @@ class JointRangeMonitor(LeafSystem):
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check_joint_ranges)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            period, 0.0, self._hold_ik_status_and_check_joint_ranges
+        )
 
-    def _check_joint_ranges(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _hold_ik_status_and_check_joint_ranges(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -97,7 +97,7 @@ class JointControlConfig:
             )
 
 
-@njit(cache=True, borrows=True)
+@njit(cache=True, omits_reference_counting=True)
 def computed_torque_into(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
@@ -106,12 +106,12 @@ def computed_torque_into(
     ID is the inverse dynamics, `state` [q; v]; tau is limited. Invalid encoder readings give
     gravity compensation at the commanded posture; an invalid command keeps the last torque.
     """
-    if not all_in_range(command):
+    if not are_finite_and_in_range(command):
         return
     n = torque.shape[0]
     q, v, acceleration = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
     copy_into(scratch, 0, state, 0, 2 * n)
-    if not all_in_range(state):
+    if not are_finite_and_in_range(state):
         copy_into(q, 0, command, 0, n)
         v[:] = 0.0
     for i in range(n):
@@ -191,7 +191,7 @@ class HeldTorque(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         torque = self._request.Eval(context)
-        if all_in_range(torque):
+        if are_finite_and_in_range(torque):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))
 
 

@@ -12,14 +12,14 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 
-FRICTION_TANH_SPEED = 2e-3
+ARM_FRICTION_TANH_SPEED_RAD_OR_M_S = 2e-3
 """Speed v_0 of the friction law [rad/s, m/s], estimate."""
 
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
     """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
-    return -coulomb * np.tanh(speed / FRICTION_TANH_SPEED)
+    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
 
 
 @njit(cache=True)

@@ -72,7 +72,7 @@ def repair_and_parse_model(
     purpose = purpose._replace(plant_has_shapes=plant.geometry_source_is_registered())
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
-    files.add_packages_to_map(parser.package_map())
+    files.merge_packages_with_map(parser.package_map())
     files.check_referenced_files(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     weakref.finalize(plant, folder.cleanup)  # Drake reads converted meshes later
@@ -137,7 +137,7 @@ def _repair_file(
 
 
 @dataclass(frozen=True)
-class ParsedModel:
+class ParsedArm:
     """Arm that was parsed into a plant."""
 
     instance: ModelInstanceIndex
@@ -152,7 +152,7 @@ def ParseModel(
     package_paths: tuple[Path, ...] = (),
     X_WBase: RigidTransform | None = None,
     hold: dict[str, float] | None = None,
-) -> ParsedModel:
+) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
     A free base is welded to the world at `X_WBase`, the joints `hold` at the given positions
@@ -180,7 +180,7 @@ def ParseModel(
         remedy = "write the chain up to the sensor as one model"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     instance = next(iter(instances), frame.model_instance())
-    return ParsedModel(instance, frame, [*repaired.assumptions, *free, *held, *rotors])
+    return ParsedArm(instance, frame, [*repaired.assumptions, *free, *held, *rotors])
 
 
 def ParseTool(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import (
@@ -127,7 +127,7 @@ def _is_joint_held_at_limit(q, lower, upper, i, push):
 
 
 @njit(cache=True)
-def _damped_step(H, g, damping, q, lower, upper, trial):
+def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
     """Write q plus a damped step to trial (n,); return the largest joint displacement.
 
     Joints that would pass a limit are fixed there, and the step of the others is solved again.
@@ -199,9 +199,9 @@ def follow_pose(
         q[i] = min(max(reference[i], lower[i]), upper[i])
         low[i], high[i] = max(q[i] - max_step[i], lower[i]), min(q[i] + max_step[i], upper[i])
     length = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3]
-    if not (all_in_range(reference) and all_in_range(pose) and length > 0.0):
+    if not (are_finite_and_in_range(reference) and are_finite_and_in_range(pose) and length > 0.0):
         for i in range(n):
-            q[i] = q[i] if all_in_range(reference) else np.nan
+            q[i] = q[i] if are_finite_and_in_range(reference) else np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
@@ -239,7 +239,10 @@ def follow_pose(
                     for k in range(6):
                         g[i] += J[k, i] * e[k]
             stiff = damping + max(_MIN_STEP_DAMPING_M2, relative_damping * squared)
-            if _damped_step(H, g, stiff, q, low, high, trial) < _POSE_ROUNDING_ERROR_M:
+            if (
+                _take_damped_step_within_limits(H, g, stiff, q, low, high, trial)
+                < _POSE_ROUNDING_ERROR_M
+            ):
                 break
             found = _jacobian_and_pose_error(table, L, pose, trial, x, J, e)
             total = found
@@ -359,7 +362,7 @@ def _follow_command(
     """
     n = q.shape[0]
     copy_into(q, 0, last, 0, n)
-    if not all_in_range(position):
+    if not are_finite_and_in_range(position):
         return _BAD_POSE
     reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)
     if elapsed > 0.0:  # inf * 0 is nan

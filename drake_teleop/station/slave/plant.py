@@ -29,7 +29,11 @@ from drake_teleop.station.slave.arm_from_plant import (
 )
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_holding_torque, find_start_posture
+from drake_teleop.station.slave.home import (
+    R_WS_HOME,
+    check_inertia_and_holding_torque,
+    find_start_posture,
+)
 from drake_teleop.station.slave.joint_friction import JointFriction
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
@@ -76,7 +80,7 @@ class SlavePlant:
 
     @cached_property
     def physics_of_plant(self) -> tuple[Array, ...]:
-        """Argument `physics` of `plant_rates`.
+        """Argument `physics` of `contact_and_plant_rates_into`.
 
         It contains the arm's table with dry friction, and the load in this table, which a grasp
         changes. Then follow pairs of shapes in contact, the sheet spring's leaf, joints of moving
@@ -173,7 +177,7 @@ def AddSlavePlant(
     instance, tool = parsed.instance, parsed.tool
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
-        finalize_plant(plant)
+        finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
         _remove_visual_shapes(plant, scene_graph)
@@ -183,7 +187,7 @@ def AddSlavePlant(
     arm, assumptions = parsed.arm()
     start = find_start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_holding_torque(arm, start)
+        check_inertia_and_holding_torque(arm, start)
     friction = values_per_joint(arm, slave.friction, "slave.friction", 0.0)
     if friction.any():
         law = JointFriction(friction, arm.velocity_index, plant.num_velocities())
@@ -261,7 +265,7 @@ def bodies_carried_by(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]
     return near + [far for each in near for far in bodies_carried_by(plant, each)]
 
 
-def finalize_plant(plant: MultibodyPlant) -> None:
+def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
     """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
@@ -288,10 +292,10 @@ def _remove_arm_collisions(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hull_corners_beyond_sensor_S(slave: Slave) -> list[Array]:
+def _hull_corners_of_carried_shapes_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
-    finalize_plant(plant)
+    finalize_without_limit_warnings(plant)
     context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
     hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
     for body in bodies_carried_by(plant, parsed.sensor_frame.body()):
@@ -327,19 +331,19 @@ def _tip_of_tool(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: 
         context = plant.CreateDefaultContext()
         return tip.CalcPose(context, parsed.sensor_frame).translation()
     reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hull_corners_beyond_sensor_S(slave)):
+    if slave.tool is None and (hulls := _hull_corners_of_carried_shapes_S(slave)):
         return _farthest_hull_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 
-def read_arm_kinematics(
+def read_arm_without_default_limits(
     model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
 ) -> ArmModel:
     """Return the arm in a model file, without default limits, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
-        finalize_plant(plant)
+        finalize_without_limit_warnings(plant)
         arm = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
     arm.pose(np.zeros(arm.num_joints))  # Load the compiled function before the first reading.
     return arm

@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
-    add_into,
+    add_vector_into,
     copy_into,
     cross,
     minus,
@@ -22,9 +22,9 @@ from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, pose
 from drake_teleop.station.environment.point_contact import (
     BOX_BODY_ROW_COLUMN,
     NUM_PAIR_COLUMNS,
-    contact_force,
     depth_of_sphere_in_box,
-    min_distance_of_boxes,
+    lower_bound_of_box_distance,
+    point_contact_force_into,
 )
 from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import ToolContactModel
@@ -36,13 +36,13 @@ _MAX_TOUCHING_GAP_M = 1e-9  # m
 
 
 @njit(cache=True)
-def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
+def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
     """Write the environment's wrench (6,) on the tool, about the world's origin, in W [N, N m].
 
     Args:
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `ShapePairs.compiled_pairs`.
-        joints: (m, 21) joints of moving bodies, from `MakeJointTable`.
+        joints: (m, 21) joints of moving bodies, from `MakeJointTableAndRowBodies`.
         applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
@@ -58,7 +58,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
-    add_into(wrench_W, 3, cross(p_WS, applied_W))
+    add_vector_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed)
         depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
@@ -79,7 +79,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
                 velocity[i] -= point_velocity[i]
-        contact_force(pair, depth, normal[:3], velocity, force)
+        point_contact_force_into(pair, depth, normal[:3], velocity, force)
         add_force_to_wrench(wrench_W, normal[3:], force)
 
 
@@ -109,7 +109,10 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
         box = _place_box_at_body(pair, bodies, placed)
-        if min_distance_of_boxes(pair, box, p_WS, R_WS, sheet[0]) < _NEAR_MONITORED_DISTANCE_M:
+        if (
+            lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
+            < _NEAR_MONITORED_DISTANCE_M
+        ):
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed)
@@ -121,8 +124,8 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
 @njit(cache=True)
 def add_force_to_wrench(wrench_W, p_WC, force_W):
     """Add a force (3,) at the point C to a wrench (6,) about the world's origin, in W."""
-    add_into(wrench_W, 0, force_W)
-    add_into(wrench_W, 3, cross(p_WC, force_W))
+    add_vector_into(wrench_W, 0, force_W)
+    add_vector_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):
@@ -152,7 +155,9 @@ class ToolContact(LeafSystem):
         q, v = state[: self._n], state[self._n :]
         sheet = self._nothing if self._sheet is None else self._sheet.Eval(context)
         plant = self._nothing if self._plant is None else self._plant.Eval(context)
-        environment_wrench(*self._contact, q, v, sheet, plant, output.get_mutable_value())
+        environment_wrench_about_Wo_into(
+            *self._contact, q, v, sheet, plant, output.get_mutable_value()
+        )
 
 
 @njit(cache=True)
@@ -166,7 +171,7 @@ def assemble_plant_state(state, around, x):
 
 
 @njit(cache=True)
-def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
+def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     """Write the time derivative xdot (2 n + 2,) of the state x, and the contact wrench.
 
     `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m].
@@ -176,12 +181,16 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
     q, v = x[: half - 1], x[half : 2 * half - 1]
     sheet, plant = x[half - 1 : 2 * half : half], x[2 * half :]
     if not _take_or_request_given_wrench(given, x, wrench_W):
-        environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
+        environment_wrench_about_Wo_into(
+            arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W
+        )
     else:
         applied = np.empty(6)
-        environment_wrench(arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied)
+        environment_wrench_about_Wo_into(
+            arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied
+        )
         wrench_W += applied
-    plant_rates_under_wrench(physics, x, tau, applied_W, wrench_W, xdot)
+    plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot)
 
 
 @njit(cache=True)
@@ -203,7 +212,7 @@ def _take_or_request_given_wrench(given, x, wrench_W):
 
 
 @njit(cache=True)
-def plant_rates_under_wrench(physics, x, tau, applied_W, wrench_W, xdot):
+def plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot):
     """Write the time derivative xdot of the state x under the contact wrench `wrench_W`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1

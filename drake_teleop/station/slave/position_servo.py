@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, all_in_range
+from drake_teleop.common.blocks import ONE_DICT, are_finite_and_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -103,7 +103,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and all_in_range(command):
+    if memory[_PERIODS_SINCE_COMMAND_INDEX] == 0.0 and are_finite_and_in_range(command):
         if queued > 0.0:
             place = 2 + 3 * n + int(memory[_OLDEST_QUEUED_INDEX]) * n
             copy_into(target, 0, memory, place, n)
@@ -126,7 +126,7 @@ def _advance_joint_reference(command, interface, limits, memory, reference):
 
 
 @njit(cache=True)
-def position_servo_torque(
+def position_servo_torque_into(
     arm, command, state, interface, limits, effort_limit, scratch, memory, torque
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
@@ -137,7 +137,7 @@ def position_servo_torque(
     n = torque.shape[0]
     _advance_joint_reference(command, interface, limits, memory, scratch)
     q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
-    if all_in_range(state):
+    if are_finite_and_in_range(state):
         copy_into(q, 0, state, 0, n)
         copy_into(v, 0, state, n, n)
         for i in range(n):
@@ -186,4 +186,4 @@ class PositionServo(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         inputs = self._command.Eval(context), self._state.Eval(context)
         torque, memory = (discrete_state.get_mutable_value(group) for group in range(2))
-        position_servo_torque(self._arm, *inputs, *self._constants, memory, torque)
+        position_servo_torque_into(self._arm, *inputs, *self._constants, memory, torque)

@@ -45,7 +45,7 @@ from drake_teleop.station.slave.plant import (
     NominalSlave,
     ParseSlave,
     bodies_carried_by,
-    finalize_plant,
+    finalize_without_limit_warnings,
 )
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
@@ -93,8 +93,8 @@ class PostureShapes:
         self.tool_bodies = {body.index() for body in beyond}
         if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-        _prepare_collision_shapes(self.plant, self._scene_graph)
-        finalize_plant(self.plant)
+        _complete_and_bound_collision_shapes(self.plant, self._scene_graph)
+        finalize_without_limit_warnings(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
         self._exclude_contact_of_joined_bodies()
@@ -232,16 +232,16 @@ def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
     return np.where(around_zero, -np.pi, finite_lower), np.where(around_zero, np.pi, finite_upper)
 
 
-def start_overlaps(
+def start_overlap_texts(
     slave: Slave, environment: Environment | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
-    return _cached_start_overlaps(HashableByValue((slave, parts), slave.model_files()))
+    return _cached_overlap_texts(HashableByValue((slave, parts), slave.model_files()))
 
 
 @lru_cache(maxsize=4)
-def _cached_start_overlaps(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _cached_overlap_texts(key: HashableByValue) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
@@ -265,7 +265,7 @@ def overlap_warnings(shapes: PostureShapes, *, of_arm: bool = False) -> list[str
     return found
 
 
-def _prepare_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _complete_and_bound_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.

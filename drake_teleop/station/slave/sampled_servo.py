@@ -21,7 +21,10 @@ from drake_teleop.station.slave.joint_control import (
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
+from drake_teleop.station.slave.plant_dynamics import (
+    assemble_plant_state,
+    contact_and_plant_rates_into,
+)
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
 _MIN_SERVO_EVENT_HZ = 2000.0
@@ -72,10 +75,10 @@ def predict_torque_line(arm, command, state, sheet, servo, physics, samples, per
             rate[i] += (k - 0.5 * (samples - 1)) * torque[i]
         if k == samples - 1:
             break
-        plant_rates(physics, x, torque, no_wrench, wrench_W, xdot)
+        contact_and_plant_rates_into(physics, x, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             half[i] = x[i] + 0.5 * period * xdot[i]
-        plant_rates(physics, half, torque, no_wrench, wrench_W, xdot)
+        contact_and_plant_rates_into(physics, half, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):

@@ -29,7 +29,7 @@ from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
     BODY_STATE_SIZE,
     NUM_JOINT_COLUMNS,
-    MakeJointTable,
+    MakeJointTableAndRowBodies,
     poses_and_twists_into,
 )
 from drake_teleop.station.environment.point_contact import (
@@ -55,7 +55,7 @@ class ToolContactModel(NamedTuple):
     Attributes:
         compiled_pairs: (k, 28) `ShapePairs.compiled_pairs`; empty if `drake_contact_reason` is set.
         monitored_pairs: (l, 40) `ShapePairs.monitored_pairs`, computed by Drake at close range.
-        joint_table: (m, 21) from `MakeJointTable`, of the boxes in `compiled_pairs`.
+        joint_table: (m, 21) from `MakeJointTableAndRowBodies`, of the boxes in `compiled_pairs`.
         plant_state_size: size of the plant's state, 0 without joints.
         drake_contact_reason: why Drake's contact results replace the compiled law, or empty.
         tool_bodies, tool_shapes: indices of the tool's bodies, identifiers of their shapes.
@@ -106,7 +106,7 @@ def MakeToolContactModel(
         tool_bodies=frozenset(int(index) for index in shapes),
         tool_shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
         leaf_instance=touched.leaf_instance,
-        moving_bodies=MovingBodies(plant, touched),
+        moving_bodies=MovingBodiesExceptLeaf(plant, touched),
     )
     for part in environment.parts:
         if part.moving_part is not None:
@@ -118,7 +118,7 @@ def MakeToolContactModel(
         return contact._replace(drake_contact_reason=reason)
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
-        joints, order = MakeJointTable(plant, contact.moving_bodies.values())
+        joints, order = MakeJointTableAndRowBodies(plant, contact.moving_bodies.values())
     from_S = {
         shape: _X_SBody(plant, context, sensor_frame, index)
         for index, own in shapes.items()
@@ -168,7 +168,9 @@ def _reason_for_drake_contact(environment: Environment, contact: ToolContactMode
     return ""
 
 
-def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, BodyIndex]:
+def MovingBodiesExceptLeaf(
+    plant: MultibodyPlant, touched: AddedEnvironment
+) -> dict[str, BodyIndex]:
     """Return the moving bodies of the environment, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
@@ -208,7 +210,7 @@ class MovingBodyPose(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
-        self._joints, order = MakeJointTable(plant, [body])
+        self._joints, order = MakeJointTableAndRowBodies(plant, [body])
         self._bodies = np.empty((len(order), BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))

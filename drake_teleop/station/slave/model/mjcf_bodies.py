@@ -23,8 +23,8 @@ from drake_teleop.station.slave.model.mjcf_meshes import (
     MeshLibrary,
     combine_mass_properties,
     fit_shape_to_mesh,
-    mass_properties_of_mesh,
-    mass_properties_of_primitive,
+    unit_density_properties_of_mesh,
+    unit_density_properties_of_primitive,
 )
 from drake_teleop.station.slave.model.model_numbers import (
     MAX_MODEL_VALUE_SI,
@@ -243,7 +243,9 @@ class BodyReader:
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_mass_properties([self._mass_of_geom(geom) for geom in body.geoms])
+            given = combine_mass_properties(
+                [self._mass_properties_of_geom(geom) for geom in body.geoms]
+            )
         mass, centre, inertia = given or ZERO_MASS_PROPERTIES
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
@@ -253,14 +255,14 @@ class BodyReader:
             inertia = np.eye(3) * np.trace(inertia) / 3
         return MassProperties(max(mass, compiler.number("boundmass", 0.0)), centre, inertia)
 
-    def _mass_of_geom(self, geom: Geom) -> MassProperties:
+    def _mass_properties_of_geom(self, geom: Geom) -> MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return ZERO_MASS_PROPERTIES
         try:
-            shape = mass_properties_of_primitive(geom.kind, geom.size)
+            shape = unit_density_properties_of_primitive(geom.kind, geom.size)
             if geom.mesh:
-                shape = mass_properties_of_mesh(geom.mesh)
+                shape = unit_density_properties_of_mesh(geom.mesh)
         except ValueError as error:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return ZERO_MASS_PROPERTIES

@@ -55,7 +55,7 @@ def combine_mass_properties(parts: list[MassProperties]) -> MassProperties:
     return MassProperties(mass, centre, inertia)
 
 
-def mass_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
+def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassProperties:
     """Return the mass properties of a shape of density 1 in its own axes."""
     a, b, c = size
     if kind == "box":
@@ -76,7 +76,7 @@ def mass_properties_of_primitive(kind: str, size: list[float]) -> MassProperties
     return MassProperties(volume, np.zeros(3), np.diag(volume * moments))
 
 
-def mass_properties_of_mesh(mesh: Mesh) -> MassProperties:
+def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
     """Return the mass properties of a mesh of density 1, by MuJoCo's rule in `mesh.inertia`.
 
     The rule "legacy" counts all tetrahedra between triangles and centre as positive.
@@ -105,7 +105,7 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 
     Its size follows from the mesh's inertia, or with `by_box` from its bounding box (`fitaabb`).
     """
-    mass, centre, inertia = mass_properties_of_mesh(mesh)
+    mass, centre, inertia = unit_density_properties_of_mesh(mesh)
     moments, axes = np.linalg.eigh(inertia)
     moments, axes = moments[::-1], axes[:, ::-1]  # the longest axis becomes z
     axes[:, 2] *= np.linalg.det(axes)
@@ -178,7 +178,7 @@ class Mesh:
             faces = faces[:, ::-1]
         return Triangles(moved, faces)
 
-    def write_obj(self, folder: Path) -> Path:
+    def find_or_write_obj(self, folder: Path) -> Path:
         """Return an .obj file for Drake, written to `folder` if conversion is necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()

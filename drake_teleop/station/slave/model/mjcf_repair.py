@@ -71,7 +71,7 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     return world
 
 
-def weld_joints_outside_chain(
+def weld_other_joints_and_list_moving(
     world: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
 ) -> list[tuple[Body, Joint]]:
     """Weld free bodies and joints outside the chain; return the moving joints with their bodies.
@@ -286,7 +286,7 @@ def repair_mjcf(
         moving = [(body, joint) for body in chain for joint in body.joints]
         report_lost_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = weld_joints_outside_chain(world, chain, purpose.held_positions, mjcf)
+        moving = weld_other_joints_and_list_moving(world, chain, purpose.held_positions, mjcf)
         check_joint_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()

@@ -111,7 +111,7 @@ class MjcfText:
     def _add_mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull
         if key not in self._meshes:
-            file = mesh.write_hull(self._folder) if hull else mesh.write_obj(self._folder)
+            file = mesh.write_hull(self._folder) if hull else mesh.find_or_write_obj(self._folder)
             self._meshes[key] = f"mesh_{len(self._meshes)}"
             SubElement(self._assets, "mesh", name=self._meshes[key], file=str(file))
         return {"mesh": self._meshes[key]}

@@ -23,7 +23,9 @@ _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 _TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
 
 
-def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
+def repair_inertia_and_detect_missing(
+    link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool
+) -> bool:
     """Replace physically impossible inertia of a link by the nearest possible one.
 
     `report` receives changes and faults. A link that no joint moves (`at_rest`) loses impossible
@@ -190,14 +192,14 @@ def repair_joint(joint: Element, links: set[str], report: RepairReport, *, in_ch
             joint.remove(mimic)
         return
     if in_chain:
-        _check_joint_is_independent(joint, where, report)
+        _check_joint_type_mimic_and_axis(joint, where, report)
     for limit in joint.iter("limit"):
         _check_joint_limit(limit, where, report)
     for dynamics in joint.iter("dynamics"):
         _check_joint_dynamics(dynamics, name, report)
 
 
-def _check_joint_is_independent(joint: Element, where: str, report: RepairReport) -> None:
+def _check_joint_type_mimic_and_axis(joint: Element, where: str, report: RepairReport) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in _MOVING_JOINT_TYPES:
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""

@@ -79,7 +79,7 @@ class ModelFiles:
         self.sizes: dict[Path, tuple[int, int]] = {}  # number and bytes of files, by file
         self._bases = {""}
 
-    def add_packages_to_map(self, known: PackageMap) -> None:
+    def merge_packages_with_map(self, known: PackageMap) -> None:
         """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
@@ -100,7 +100,7 @@ class ModelFiles:
             path = None if base is None else base / match[2]
         else:
             path = (folder or self._folder) / address.removeprefix("file://")
-        return next(iter(_existing_forms_of_path(path)), None)
+        return next(iter(_existing_raw_and_normalized_paths(path)), None)
 
     def may_read_file(self, path: Path) -> bool:
         """Return whether a file is in the model's folder or a package, after resolving links."""
@@ -175,7 +175,9 @@ class ModelFiles:
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
-                found = {file for each in named for file in _existing_forms_of_path(each)}
+                found = {
+                    file for each in named for file in _existing_raw_and_normalized_paths(each)
+                }
                 yield from (each for each in found if each != path.parent)
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
@@ -227,7 +229,7 @@ def _is_installed_python_package(folder: Path) -> bool:
     )
 
 
-def _existing_forms_of_path(path: Path | None) -> list[Path]:
+def _existing_raw_and_normalized_paths(path: Path | None) -> list[Path]:
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]

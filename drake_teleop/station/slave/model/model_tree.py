@@ -58,7 +58,7 @@ def reduce_to_chain(
     for joint in list_joints(scope):
         if id(joint) not in in_chain and joint.get("name") not in hold:
             make_joint_fixed(joint, report)
-    _remove_loops(scope, num_joints_to_link, report)
+    _remove_loop_constraints(scope, num_joints_to_link, report)
     return chain, num_joints_to_link
 
 
@@ -143,7 +143,9 @@ def _remove_unconnected_links(
     return num_joints_to_link
 
 
-def _remove_loops(scope: Element, num_joints_to_link: dict[str, int], report: RepairReport) -> None:
+def _remove_loop_constraints(
+    scope: Element, num_joints_to_link: dict[str, int], report: RepairReport
+) -> None:
     for element in [child for child in scope if child.tag in _CONSTRAINT_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in names}

@@ -15,7 +15,7 @@ from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model.model_numbers import (
     check_lengths_and_inertias,
     parse_number,
-    repair_inertia,
+    repair_inertia_and_detect_missing,
     repair_joint,
     replace_commas_by_blanks,
 )
@@ -69,7 +69,7 @@ def repair_urdf(
         _keep_one_material_per_name(root)
     repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
-        _remove_unused_elements(root, report)
+        _remove_references_to_missing_parts(root, report)
     return convert_meshes_and_write_text(
         root, file, files, report, folder if purpose.plant_has_shapes else None
     )
@@ -101,7 +101,9 @@ def repair_links_and_joints(
             for part in [link] if purpose.is_scene else link.findall("inertial"):
                 check_lengths_and_inertias(part, f"link {name}", report)
             at_rest = num_joints_to_link.get(name) == 0
-            is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
+            is_massless = repair_inertia_and_detect_missing(
+                link, report, is_sdf=is_sdf, at_rest=at_rest
+            )
             if is_massless and name in moving:
                 report.state_assumption("no inertia of", name)
 
@@ -199,7 +201,7 @@ def _has_valid_colour(material: Element) -> bool:
     return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
 
 
-def _remove_unused_elements(root: Element, report: RepairReport) -> None:
+def _remove_references_to_missing_parts(root: Element, report: RepairReport) -> None:
     links = {link.get("name", "") for link in root.findall("link")}
     moving = {joint.get("name", "") for joint in list_joints(root) if joint.get("type") != "fixed"}
     for frame in root.findall("frame"):
