@@ -159,7 +159,7 @@ def _exact_and_smooth_maximum(use, sharpness):
     return top, top + np.log(total) / sharpness
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _write_torque_use(
     table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
 ):
@@ -194,7 +194,7 @@ def _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work):
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
     seeds = work[0]
     T = len(motions)
@@ -229,7 +229,7 @@ def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, larges
         _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _write_workspace_use(
     table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
 ):
@@ -260,7 +260,7 @@ def _write_workspace_use(
         _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _write_clearance_use(
     table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
 ):
@@ -269,7 +269,7 @@ def _write_clearance_use(
     if K == 0:
         largest[6] = smooth[6] = 0.0
         return
-    use, nearest = np.empty((T, K)), np.empty(5)
+    use, nearest, point = np.empty((T, K)), np.empty(5), np.empty(3)
     ends = np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
         _transform_capsules(motions[t], limits.capsule_links, limits.capsule_ends, ends[t])
@@ -303,9 +303,9 @@ def _write_clearance_use(
                     continue
                 along, towards = nearest[side], (1.0 if side == 0 else -1.0)
                 factor = -use[t, k] / ZERO_USE_CLEARANCE_MARGIN_M * towards
-                point = limits.capsule_ends[capsule, 0] + along * (
-                    limits.capsule_ends[capsule, 1] - limits.capsule_ends[capsule, 0]
-                )
+                start, end = limits.capsule_ends[capsule, 0], limits.capsule_ends[capsule, 1]
+                for i in range(3):
+                    point[i] = start[i] + along * (end[i] - start[i])
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 add_point_to_seed(motions[t, row], point, g, seeds[row])
         _pull_back_seeds_of_sample(table, motions, qd, qdd, t, gradient, work)

@@ -174,9 +174,8 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
     n = table.shape[0] - 1
     x = np.zeros(21)
     x[12] = x[16] = x[20] = 1.0
-    for row in range(n):
-        _advance_pose_over_joint(table, row, q[row], x)
-    _advance_pose_over_joint(table, n, 0.0, x)
+    for row in range(n + 1):
+        _advance_pose_over_joint(table, row, q[row] if row < n else 0.0, x)
     for i in range(3):
         p_WS[i] = x[9 + i]
         for k in range(3):
@@ -217,9 +216,9 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     """Write specific force s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows, to out (21,)."""
     n = table.shape[0] - 1
     _write_motion_of_world_at_rest(table, out)
-    for row in range(n):
-        _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], out)
-    _advance_motion_over_joint(table, n, 0.0, 0.0, 0.0, out)
+    for row in range(n + 1):
+        qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
+        _advance_motion_over_joint(table, row, qi, vi, ai, out)
     R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
@@ -230,12 +229,11 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
     """Write the state [s, omega, alpha, p_WL, R_WL] of each link, and of S, to out (n+1, 21)."""
     n = table.shape[0] - 1
     _write_motion_of_world_at_rest(table, out[0])
-    for row in range(n):
+    for row in range(n + 1):
         if row > 0:
             out[row] = out[row - 1]
-        _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], out[row])
-    out[n] = out[n - 1]
-    _advance_motion_over_joint(table, n, 0.0, 0.0, 0.0, out[n])
+        qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
+        _advance_motion_over_joint(table, row, qi, vi, ai, out[row])
 
 
 @njit(cache=True, inline="always")
@@ -287,10 +285,8 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     link = np.empty((n + 1, 12))
     _write_motion_of_world_at_rest(table, x)
     for row in range(n + 1):
-        if row < n:
-            _advance_motion_over_joint(table, row, q[row], v[row], vdot[row], x)
-        else:
-            _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
+        qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
+        _advance_motion_over_joint(table, row, qi, vi, ai, x)
         _write_joint_axis_and_inertial_wrench(table, row, x, link)
     _project_wrenches_on_joints(table, link, tau_out)
     for row in range(n):
@@ -391,10 +387,8 @@ def forward_dynamics(
     M = np.empty((n, n))
     _write_motion_of_world_at_rest(table, x)
     for row in range(n + 1):
-        if row < n:
-            _advance_motion_over_joint(table, row, q[row], v[row], 0.0, x)
-        else:
-            _advance_motion_over_joint(table, row, 0.0, 0.0, 0.0, x)
+        qi, vi = (q[row], v[row]) if row < n else (0.0, 0.0)
+        _advance_motion_over_joint(table, row, qi, vi, 0.0, x)
         _write_joint_axis_and_inertial_wrench(table, row, x, link)
         _add_link_inertia_about_world(table, row, x, inertia[row])
     for k in range(6):
