@@ -17,9 +17,9 @@ from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBo
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
-    refuse_to_replace_inputs,
     models_dir,
     output_folder,
+    refuse_to_replace_inputs,
     write_json,
 )
 from drake_teleop.common.numeric import Array, contact_spans

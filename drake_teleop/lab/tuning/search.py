@@ -1,8 +1,8 @@
 """Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
 
 Limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
-its softest and stiffest wall and between them, with several seeds. Then gamma grows until a run
-fails.
+its softest and stiffest wall and between them, with several seeds. There gamma grows until a run
+fails, or becomes smaller.
 """
 
 from __future__ import annotations
@@ -37,12 +37,11 @@ CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 """Candidates; others are dominated by them or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
-FAILING_OVER_STATED_MARGIN = 1.2
-"""Ratio of the factor of gamma that fails to the stated margin; the search is as fine."""
+BEYOND_MARGIN_FACTOR = 1.2
+"""Factor of the margin of gamma at which a failure is searched."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
-_MAX_MARGIN = 16.0  # factor of gamma at which the search for a failure ends
 _GAMMA_STEP_ABOUT_NOISE_LIMIT = (
     1.03  # gamma fails and holds by so much above and below that of accepted noise
 )
@@ -57,14 +56,12 @@ class SearchResult:
 
     Attributes:
         searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
-        margin: factor of gamma up to which the settings hold.
         given_runs: runs of the user's settings at the stiffest wall.
-        inside_runs: runs that hold, with gamma and up to the margin.
-        beyond_runs: runs with the smallest factor of gamma that fails, or with the largest factor.
+        inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
+        beyond_runs: runs with a gamma that is `BEYOND_MARGIN_FACTOR` larger.
     """
 
     settings: TunedSettings
-    margin: float
     searched_settings: list[Row]
     given_runs: list[Row]
     inside_runs: list[Row]
@@ -113,9 +110,11 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
+        settings = settings_from_values(row)
+        cap = caps[settings.low_pass_hz] / margin
+        gamma, inside = _find_gamma_limit_in_station(settings, cap, trial, execute)
         if inside:
-            chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
+            chosen = dataclasses.replace(settings, gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -125,42 +124,18 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
             remedy="state firmer hands, softer walls or a faster network",
         )
     _, chosen, inside = found[0]
-    stated_margin, held, beyond = _find_gamma_margin_and_runs(chosen, trial, execute)
-    return SearchResult(chosen, stated_margin, search, given, [*inside, *held], beyond)
-
-
-def _find_gamma_margin_and_runs(
-    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
-) -> tuple[float, list[Row], list[Row]]:
-    """Return the factor of gamma up to which the settings hold, these runs, and those beyond."""
-    stated = trial.stated_set
-    required = stated.requirements.loop_gain_margin
-    hands, walls = (
-        list(dict.fromkeys((ends[0], ends[-1]))) for ends in (stated.hands, stated.walls)
-    )
-    stable, failing = required, np.inf
-    factor = FAILING_OVER_STATED_MARGIN * required
-    held: list[Row] = []
-    beyond: list[Row] = []
-    while stable < _MAX_MARGIN and failing > FAILING_OVER_STATED_MARGIN * stable:
-        tried = dataclasses.replace(settings, gamma=factor * settings.gamma)
-        study = _study_of_settings(tried, hands, walls, repeats=2)
-        rows = execute(f"margin_{factor:.6g}", study, trial)
-        if all(map(meets_requirements, rows)):
-            stable, held = factor, [*held, *rows]
-        else:
-            failing, beyond = factor, rows
-        factor = 2 * stable if failing == np.inf else float(np.sqrt(stable * failing))
-    if failing == np.inf:
-        return stable, held[: -len(rows)], rows
-    margin = max(required, failing / FAILING_OVER_STATED_MARGIN)
-    return margin, [row for row in held if row["gamma"] <= margin * settings.gamma], beyond
+    larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
+    study = _study_of_settings(larger, ends, list(stated.walls[::-1]), repeats=2)
+    return SearchResult(chosen, search, given, inside, execute("larger_gamma", study, trial))
 
 
 def _find_gamma_limit_in_station(
-    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
+    settings: TunedSettings, cap: float, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
+    """Return the largest gamma up to `cap` that holds, and its runs; 0: none holds.
+
+    The search starts at the gamma of `settings`, which holds in one axis.
+    """
 
     def holds(rows: list[Row]) -> bool:
         return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
@@ -187,9 +162,12 @@ def _find_gamma_limit_in_station(
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
                 smaller = max(smaller, quiet / _GAMMA_STEP_ABOUT_NOISE_LIMIT)
                 failed = min(failed, quiet * _GAMMA_STEP_ABOUT_NOISE_LIMIT)
-        if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
+        if min(failed, cap) <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
             break
-        gamma = float(np.sqrt(stable * failed)) if stable else smaller
+        if failed == np.inf:
+            gamma = min(2 * stable, cap)
+        else:
+            gamma = float(np.sqrt(stable * failed)) if stable else smaller
     return stable, inside
 
 

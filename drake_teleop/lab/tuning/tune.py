@@ -129,7 +129,7 @@ def _make_tuning_summary(
         if all(map(meets_requirements, found.given_runs))
         else None,
         "rest_force_N": max(row["rest_force_N"] for row in edge),
-        "margin": found.margin,
+        "margin": stated.requirements.loop_gain_margin,
         "fails_at": {
             "hand": failed[0]["hand"],
             "wall_N_per_m": failed[0]["wall"],
@@ -170,7 +170,7 @@ def _tuning_result_sentences(
         f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {scale:.4g}, and a low-pass of "
         f"{chosen.low_pass_hz:g} Hz.",
         f"The station is stable for a {hands} grip at walls of {low:g} to {high:g} kN/m over "
-        f"{about['network']}, also with gamma {figures['margin']:.2f} times as large.",
+        f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
         f"It renders {figures['share']:.2f} to {figures['largest_share']:.2f} of the scaled "
         f"contact force; above 5 Hz the force at rest has {figures['rest_force_N']:.3f} N rms.",
         f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
