@@ -32,9 +32,10 @@ def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False
     valid = np.abs(array) <= MAX_ARRAY_VALUE  # False for NaN
     if not valid.all():
         first = tuple(int(i) for i in np.argwhere(~valid)[0])
-        what, remedy = f"is not finite at index {first}", "replace NaN and infinity"
+        place = f" at index {first}" if first else ""
+        what, remedy = f"is not finite{place}", "replace NaN and infinity"
         if np.isfinite(array[first]):
-            what = f"is {array[first]:g} at index {first}, outside +-{MAX_ARRAY_VALUE:g}"
+            what = f"is {array[first]:g}{place}, outside +-{MAX_ARRAY_VALUE:g}"
             remedy = "correct the value or its unit"
         raise DrakeTeleopError(what, where=name, remedy=remedy)
     return array

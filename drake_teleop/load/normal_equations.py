@@ -24,7 +24,6 @@ from drake_teleop.common.numeric import (
     finite_array,
     nonnegative_array,
     positive_array,
-    to_float,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough, mark_undetermined
 from drake_teleop.load.regressor import regressor
@@ -159,7 +158,7 @@ class SecondMoments:
             covariance=covariance,
             identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
-            delay_s=to_float("delay_s", delay_s),
+            delay_s=float(finite_array("delay_s", delay_s)),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.num_samples),
             method="batch least squares",
             samples=int(self.num_samples),

@@ -507,3 +507,13 @@ def test_too_large_values_are_an_error_with_their_index(value, index):
         identify(*arrays)
     arrays[index][7, 2] = np.copysign(1e30, value)
     assert np.isfinite(identify(*arrays).mass)
+
+
+@pytest.mark.parametrize("delay", [np.nan, -np.inf, 1e31])
+def test_delay_of_a_fit_is_a_time(delay):
+    rng = np.random.default_rng(0)
+    motion = [rng.normal(size=(50, 3)) for _ in range(3)]
+    wrench = non_contact_wrench(*motion, TOOL)
+    assert identify(wrench, *motion, delay_s=0.02).delay_s == 0.02
+    with pytest.raises(DrakeTeleopError, match="^delay_s: is "):
+        identify(wrench, *motion, delay_s=delay)

@@ -179,10 +179,19 @@ def test_channels_far_below_the_uncertainty_have_a_positive_floor():
     assert np.linalg.eigvalsh(floor.correlation)[0] > 0.0
 
 
-@pytest.mark.parametrize("delay", [1e300, -1e300, 5.0])
+@pytest.mark.parametrize("delay", [1e29, -1e29, 5.0])
 def test_delay_beyond_the_record_is_refused(delay, tmp_path):
     line = error_line(lambda: identify_log(log_file(tmp_path), delay=delay))
     assert f"a delay of {delay:g} s leaves 0 of 60 samples" in line
+
+
+@pytest.mark.parametrize(
+    ("delay", "fault"),
+    [(1e300, "is 1e+300, outside"), (-1e300, "is -1e+300, outside"), (np.nan, "is not finite;")],
+)
+def test_delay_that_is_no_time_is_refused(delay, fault, tmp_path):
+    line = error_line(lambda: identify_log(log_file(tmp_path), delay=delay))
+    assert line.startswith(f"delay: {fault}")
 
 
 @pytest.mark.parametrize(
