@@ -515,5 +515,5 @@ def test_delay_of_a_fit_is_a_time(delay):
     motion = [rng.normal(size=(50, 3)) for _ in range(3)]
     wrench = non_contact_wrench(*motion, TOOL)
     assert identify(wrench, *motion, delay_s=0.02).delay_s == 0.02
-    with pytest.raises(DrakeTeleopError, match="^delay_s: is "):
+    with pytest.raises(DrakeTeleopError, match=r"^delay_s: is "):
         identify(wrench, *motion, delay_s=delay)
