@@ -46,7 +46,7 @@ class _YamlLoader(yaml.SafeLoader):
         super().fetch_flow_collection_start(TokenClass)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        # Counted here too, to stop reading a huge file early.
+        # Refuses more than _MAX_YAML_VALUES values, to stop reading a huge file early.
         self.nodes = getattr(self, "nodes", 0) + 1
         if self.nodes > 2 * _MAX_YAML_VALUES:  # names are nodes too
             what = f"there are more than {_MAX_YAML_VALUES} values"

@@ -143,8 +143,11 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def copy_state_and_get_clutch_wait_s(self, other: _Station, new_channel: bool) -> float:
-        """Copy another station's state; return how long the clutch must stay open [s]."""
+    def take_over_and_get_clutch_wait_s(self, other: _Station, new_channel: bool) -> float:
+        """Take over another station's state and fade to this station's force.
+
+        With a new channel, open the clutch and return how long it must stay open [s]; else 0.
+        """
         excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
@@ -238,7 +241,7 @@ class Session:
         scenario.check()
         estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.copy_state_and_get_clutch_wait_s(
+        wait_s = station.take_over_and_get_clutch_wait_s(
             self._station, inputs.channel_choices != self.inputs.channel_choices
         )
         if wait_s:

@@ -253,7 +253,9 @@ def _read_document(path: str | Path) -> dict[str, Any]:
 
     if not os.path.exists(path):
         raise DrakeTeleopError(
-            "cannot be read (no such file)", where=str(path), remedy="run `identify` first"
+            "cannot be read (no such file)",
+            where=str(path),
+            remedy="check the path, or run `identify` first",
         )
     document = read_json(path)
     if not isinstance(document, dict):

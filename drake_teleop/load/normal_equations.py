@@ -80,7 +80,9 @@ class NoiseStd:
 
 
 class SecondMoments:
-    """Sum of z z^T (19, 19) over the samples of a record, from which load and offsets are solved.
+    """Sum of z z^T (19, 19) over the samples, from which load and offsets are solved.
+
+    z = [1; wrench; s; alpha; products of omega].
 
     Args:
         noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.

@@ -194,7 +194,10 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return a function of the times, with the results of `sensor_motion`."""
+    """Return a random motion between rests: `sensor_motion` as a function of times [s].
+
+    `scale` multiplies the amplitudes of the joints.
+    """
     sine, cosine = (
         random.normal(size=(2, 6, harmonics - 1)) * scale * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
     )

@@ -701,7 +701,7 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "501"))
     with pytest.raises(
         DrakeTeleopError,
-        match=r"many\.yaml: 100,200 runs need your consent; confirm them by --yes",
+        match=r"many\.yaml: 100,200 runs need a confirmation; confirm them by --yes",
     ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):

@@ -59,7 +59,7 @@ class ReportCurves:
 
 def write_report(summary: Mapping[str, Any], curves: ReportCurves, out: Path) -> None:
     pictures = {
-        "bode": draw_bode(curves, summary["measured"]),
+        "bode": draw_rendered_impedance(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
         "passive": draw_absolute_stability(curves),
         "widths": draw_z_widths(curves, summary["z_width"]),
@@ -113,7 +113,7 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
     )
 
 
-def draw_bode(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
+def draw_rendered_impedance(curves: ReportCurves, measured: Mapping[str, Any] | None) -> Figure:
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     stiffness, damping = curves.wall
     environments = {

@@ -84,7 +84,7 @@ class StartRegion:
 
     @property
     def preferred_position(self) -> Array:
-        """Preferred position p_WS (3,) of the sensor [m]."""
+        """Position p_WS (3,) near which a start posture is best [m]: above the region's plane."""
         r, height = _PREFERRED_RADIUS_OVER_REACH * self.reach, self.plane_height + self.tool_length
         height = max(
             height + _PREFERRED_TOOL_HEIGHT_OVER_REACH * self.reach,

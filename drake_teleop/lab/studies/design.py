@@ -180,7 +180,7 @@ class Study:
             return
         if yes is False or not yes(f"{where}: {count}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
-            raise DrakeTeleopError(f"{count} need your consent", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"{count} need a confirmation", where=where, remedy=remedy)
 
     def points(self) -> list[FactorValues]:
         """Return all points (field -> value); of an adaptive design, the first ones."""

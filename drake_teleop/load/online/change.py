@@ -179,7 +179,7 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 
 @njit(cache=True)
-def _inflate_inertia_variances(memory, noise, block):
+def _widen_inertias_by_alpha_noise(memory, noise, block):
     theta = memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
     P = memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
@@ -255,7 +255,7 @@ def _test_block_for_change(memory, block, noise, window, hold, mass_std_ratio):
         memory[_STATE_INDEX] = STATE_CHANGED
     elif memory[_STATE_INDEX] == STATE_CHANGED and _is_new_load_identified(memory, mass_std_ratio):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
-        _inflate_inertia_variances(memory, noise, block)
+        _widen_inertias_by_alpha_noise(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
         memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
         share = block / memory[_ESTIMATE_AGE_INDEX]

@@ -286,7 +286,10 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
 
 
 def fits_with_other_torque_units(state: FittedModel) -> list[FittedModel]:
-    """Return the fits with other torque units that explain the record nearly as well."""
+    """Return fits with a similar torque unit that explain the record nearly as well.
+
+    Such units are within a factor of 2 of the found one; none without a torque factor.
+    """
     factor, found = state.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

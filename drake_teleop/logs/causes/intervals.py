@@ -48,7 +48,10 @@ def load_covariance(
 def load_deviations_if_unexplained(
     state: FittedModel, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
+    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause.
+
+    Those of the jackknife are widened by smooth misfit, rejected causes and gain errors.
+    """
     least = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL
     if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
         least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL

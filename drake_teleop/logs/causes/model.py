@@ -204,7 +204,7 @@ class Model:
         return Rotation.from_rotvec(x[:, self.parameter_slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return the derivative (size, 6, k) of the coefficients of k signals by parameters x."""
+        """Return d coefficients / dx (size, 6, k), of k signals in the wrench by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _ROTATION_DIFFERENCE_STEP_RAD

@@ -71,7 +71,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
             what = "the fitted mass is negative in all episodes"
-            remedy = "set wrench.sign: -1 in a --description"
+            remedy = "set wrench.sign: -1 in a --description, or remove it there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
         def counted_excess(phi: Array) -> float:

@@ -23,7 +23,10 @@ _MIN_REJECTION_MARGIN_S = 0.1
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return (M,) True for contact, impact or saturation, and a note for the user."""
+    """Return True for instants (M,) with contact, impact or saturation, and a note or "".
+
+    `spacing` is that of the splines' knots [s]. The note says that nothing could be rejected.
+    """
     # A Gaussian gain, one half at `_HALF_GAIN_FREQUENCY_OVER_KNOT_RATE` / h, does not ring.
     gain = 0.5 ** ((spectra.bands.frequency * spacing / _HALF_GAIN_FREQUENCY_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid

@@ -250,7 +250,10 @@ class NoiseLevels:
         return np.flatnonzero(np.diff(self.group_of_band, prepend=-1))
 
     def negative_log_likelihoods(self, power: Array) -> Array:
-        """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""
+        """Return each channel's negative log likelihood (..., 6), Eq. (T75).
+
+        `power` (..., bands, 6) are noise powers.
+        """
         return np.asarray(self.half_dof_of_bands @ np.log(power))
 
 

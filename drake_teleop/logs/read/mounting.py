@@ -30,7 +30,10 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
+    """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock.
+
+    Specific force, and with `gyroscope` also angular velocity.
+    """
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
         pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))

@@ -64,7 +64,9 @@ def read_table(path: Path, *, header: bool = True) -> Table:
 
 def require_file(path: Path, *, folder: bool = False) -> None:
     if not (os.path.isdir if folder else os.path.isfile)(path):
-        what = "is a folder, not a file" if os.path.isdir(path) else "no such file"
+        what = "no such folder" if folder else "no such file"
+        if os.path.exists(path):
+            what = "is a file, not a folder" if folder else "is a folder, not a file"
         raise DrakeTeleopError(what, where=str(path), remedy="check the path")
 
 

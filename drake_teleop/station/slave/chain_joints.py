@@ -83,6 +83,7 @@ def weld_base_and_find_chain(
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
+    """Weld bodies without a joint to the world; return a list with at most one note on them."""
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
