@@ -115,24 +115,20 @@ def output_folder(
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
 
 
-def refuse_to_replace_inputs(result: Path, input_path: str | Path | None = None) -> None:
-    """Raise DrakeTeleopError if `result` would replace `input_path` or be in a drive's folder.
+def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -> None:
+    """Raise DrakeTeleopError if `path` would replace `input_path` or be in a drive's folder.
 
     An `input_path` that is no file, such as a shipped name, is ignored.
     """
-    if not result.exists():
+    if not path.exists():
         return
-    what = "a recorded drive" if (result.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
-    if (
-        input_path is not None
-        and os.path.isfile(input_path)
-        and os.path.samefile(input_path, result)
-    ):
-        what = f"the input {result.name}"
+    what = "a recorded drive" if (path.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
+    if input_path is not None and os.path.isfile(input_path) and os.path.samefile(input_path, path):
+        what = f"the input {path.name}"
     if what:
         raise DrakeTeleopError(
             f"contains {what}, which the results would replace",
-            where=str(result.parent),
+            where=str(path.parent),
             remedy="give another --out",
         )
 

@@ -57,12 +57,8 @@ def load_deviations_if_unexplained(
             1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
         )
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
-    variance = (
-        jackknife_std**2
-        + _load_variances_by_rejected_causes(state, lasting)
-        + np.diag(gain_covariance)
-    )
-    return np.asarray(np.sqrt(variance))
+    variance = jackknife_std**2 + _load_variances_by_rejected_causes(state, lasting)
+    return np.asarray(np.sqrt(variance + np.diag(gain_covariance)))
 
 
 def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
