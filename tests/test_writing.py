@@ -119,7 +119,7 @@ def test_last_file_marks_a_complete_folder(tmp_path):
     for name in ("summary.json", "earlier", "a"):
         make_folder(out)
         (out / name).touch()
-    with pytest.raises(CannotWrite) as error, output_folder(out, kept=["earlier"]):
+    with pytest.raises(CannotWrite) as error, output_folder(out, valid_after_failure=["earlier"]):
         write_text(out / "a", "a")
         write_text(out / "b", "b")
         (out / "c").mkdir()

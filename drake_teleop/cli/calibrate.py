@@ -87,8 +87,8 @@ def calibrate_command(
     return summary
 
 
-def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
-    table = Table(title=f"{at.record_length_s:.1f} s recorded", title_justify="left")
+def make_progress_table(evaluation: RecordEvaluation, tolerance: Tolerance) -> Group:
+    table = Table(title=f"{evaluation.record_length_s:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
@@ -101,41 +101,47 @@ def make_progress_table(at: RecordEvaluation, tolerance: Tolerance) -> Group:
         if name in entry
     ]
     values = sizes = np.full(len(units), np.nan)
-    if at.identified_log is not None:
-        phi = at.identified_log.identification.phi
+    if evaluation.identified_log is not None:
+        phi = evaluation.identified_log.identification.phi
         values, sizes = (
             display_values_of_required_entries(tolerance, phi),
             tolerances_in_display_units(tolerance, phi),
         )
     for k, entry in enumerate(tolerance.required_entry_names):
-        half = at.relative_half_widths[k]
+        half = evaluation.relative_half_widths[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            *(_make_progress_bar(half, bool(at.is_known[k])), _parameter_verdict(at, k)),
+            _make_progress_bar(half, bool(evaluation.is_known[k])),
+            _parameter_verdict(evaluation, k),
         )
     lines = [
-        Text(line, style="red") for line in (*at.doubts, *([at.failure] if at.failure else []))
+        Text(line, style="red")
+        for line in (*evaluation.doubts, *([evaluation.failure] if evaluation.failure else []))
     ]
-    if at.advice:
-        lines.append(Text(f"-> {at.advice}", style="bold"))
+    if evaluation.advice:
+        lines.append(Text(f"-> {evaluation.advice}", style="bold"))
     return Group(table, *lines)
 
 
-def _make_progress_bar(half: float, known: bool) -> Text:
-    share = 1.0 - np.log10(max(half, 1.0)) / _PROGRESS_DECADES if np.isfinite(half) else 0.0
+def _make_progress_bar(relative_half_width: float, known: bool) -> Text:
+    share = (
+        1.0 - np.log10(max(relative_half_width, 1.0)) / _PROGRESS_DECADES
+        if np.isfinite(relative_half_width)
+        else 0.0
+    )
     cells = int(np.clip(share, 0.0, 1.0) * _PROGRESS_CELLS)
     return Text("█" * cells + "·" * (_PROGRESS_CELLS - cells), style="green" if known else "yellow")
 
 
-def _parameter_verdict(at: RecordEvaluation, k: int) -> str:
-    if at.is_known[k]:
+def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
+    if evaluation.is_known[k]:
         return "known"
-    if not np.isfinite(at.relative_half_widths[k]):
+    if not np.isfinite(evaluation.relative_half_widths[k]):
         return "not known: no information yet"
-    if at.doubts:
+    if evaluation.doubts:
         return "not known: see below"
-    return "almost" if at.relative_half_widths[k] <= 1.0 else "not known"
+    return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
 def draw_uncertainty_over_time(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:

@@ -156,26 +156,26 @@ def _refuse_options_without_model(*options: object) -> None:
             )
 
 
-def summarize_excitation(found: Excitation) -> dict[str, Any]:
-    robot, trajectory = found.robot, found.trajectory
+def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
+    robot, trajectory = excitation.robot, excitation.trajectory
     names = (*_OFFSET_NAMES, *_PHI_NAMES)
     return {
         "robot": robot.name,
-        "criterion": found.criterion,
-        **found.values,
+        "criterion": excitation.criterion,
+        **excitation.values,
         "meaning": {
             name: CRITERION_TEXTS[name].format(L=robot.criterion_scales.length)
-            for name in found.values
+            for name in excitation.values
         },
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
             use.limit_name: {"share": use.used_share, "where": use.where, "t": use.time_s}
-            for use in found.limit_uses
+            for use in excitation.limit_uses
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
-            for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
+            for name, unit, std in zip(names, _PARAMETER_UNITS, excitation.deviations, strict=True)
         },
         "noise": {
             "force [N]": robot.criterion_scales.wrench_noise[0],
@@ -186,47 +186,50 @@ def summarize_excitation(found: Excitation) -> dict[str, Any]:
     }
 
 
-def trajectory_table(found: Excitation) -> pl.DataFrame:
+def trajectory_table(excitation: Excitation) -> pl.DataFrame:
     """Return trajectory.csv: joint motion of one period at 1 kHz, both ends included."""
-    period = found.trajectory.period
+    period = excitation.trajectory.period
     t = np.linspace(0, period, round(period * CHECK_RATE_HZ) + 1)
     columns = {"t": t}
-    joints = found.trajectory.evaluate(t)
+    joints = excitation.trajectory.evaluate(t)
     for symbol, values in zip(("q", "qd", "qdd"), joints, strict=True):
-        for name, of_joint in zip(found.robot.arm.joint_names, values.T, strict=True):
+        for name, of_joint in zip(excitation.robot.arm.joint_names, values.T, strict=True):
             columns[f"{symbol}_{name}"] = of_joint
     return pl.DataFrame(columns)
 
 
-def draw_trajectory(found: Excitation) -> Figure:
+def draw_trajectory(excitation: Excitation) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
-        _draw_joints(joints, found)
-        _draw_heaviest_load_wrench(forces, torques, found)
-        progress.step(*found.criterion_history.T, where="post", color=BLUE)
-        least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
+        _draw_joints(joints, excitation)
+        _draw_heaviest_load_wrench(forces, torques, excitation)
+        progress.step(*excitation.criterion_history.T, where="post", color=BLUE)
+        # With --until, the criterion is the period.
+        least = excitation.values.get(excitation.criterion, excitation.trajectory.period)
         progress.set(
-            title=f"{found.criterion} down to {least:.4g}",
+            title=f"{excitation.criterion} down to {least:.4g}",
             xlabel="evaluations",
             yscale="log",
         )
     return figure
 
 
-def _draw_joints(axes: Axes, found: Excitation) -> None:
-    t = np.linspace(0, found.trajectory.period, 1000)
-    q = np.degrees(found.trajectory.evaluate(t)[0])
-    for k, name in enumerate(found.robot.arm.joint_names):
+def _draw_joints(axes: Axes, excitation: Excitation) -> None:
+    t = np.linspace(0, excitation.trajectory.period, 1000)
+    q = np.degrees(excitation.trajectory.evaluate(t)[0])
+    for k, name in enumerate(excitation.robot.arm.joint_names):
         colour, style = COLOURS[k % len(COLOURS)], ("-", "--")[k // len(COLOURS) % 2]
         axes.plot(t, q[:, k], style, color=colour, label=name)
-    axes.set(title=f"Joints of {found.robot.name} [deg]", xlim=(0, found.trajectory.period))
+    axes.set(
+        title=f"Joints of {excitation.robot.name} [deg]", xlim=(0, excitation.trajectory.period)
+    )
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
-    limits = found.robot.limits
-    s, omega, alpha = trajectory_sensor_motion(found.robot, found.trajectory)
+def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, excitation: Excitation) -> None:
+    limits = excitation.robot.limits
+    s, omega, alpha = trajectory_sensor_motion(excitation.robot, excitation.trajectory)
     wrench = non_contact_wrench(s, omega, alpha, limits.heaviest_phi)
     t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (
@@ -238,7 +241,7 @@ def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, found: Excitation) -
         axes.axhline(limit, color=BLACK, linestyle=":", label="limit")
         axes.set(
             title=f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]",
-            xlim=(0, found.trajectory.period),
+            xlim=(0, excitation.trajectory.period),
         )
     forces.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     torques.set_xlabel("t [s]")

@@ -44,13 +44,15 @@ def experiment_command(
     return table
 
 
-def next_participant(store: TrialStore, trials: int, wanted: int | None = None) -> int:
+def next_participant(
+    store: TrialStore, trials_per_participant: int, requested_number: int | None = None
+) -> int:
     """Return a participant's number: the requested, the first with trials left, or a new one."""
-    if wanted is not None:
-        return wanted
+    if requested_number is not None:
+        return requested_number
     known = store.participant_numbers()
     for number in known:
-        if len(store.read_rows(number)) < trials:
+        if len(store.read_rows(number)) < trials_per_participant:
             return number
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT_NUMBER:

@@ -132,11 +132,11 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
     print_table_and_notes(table, figures, summary, out)
 
 
-def print_table_and_notes(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, the text `figures`, the delay, the notes and the output folder."""
+def print_table_and_notes(table: Any, text: str, summary: dict[str, Any], out: Path) -> None:
+    """Print a table, a text, the delay, the notes and the output folder."""
     from rich.console import Console
 
-    lines = [figures]
+    lines = [text]
     if summary["delay_source"] != "static":
         delay = f"{summary['delay_s'] * 1e3:.2f} ms behind the wrench ({summary['delay_source']})"
         lines.append(f"motion {delay}")

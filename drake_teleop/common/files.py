@@ -34,14 +34,14 @@ class CannotWrite(DrakeTeleopError):
 
 @contextmanager
 def replace_file_on_success(
-    path: Path, *, aside: Path | None = None, shared: bool = False
+    path: Path, *, temporary_base: Path | None = None, shared: bool = False
 ) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    After a failure `path` is unchanged. `aside` is another base of the temporary name; `shared`
-    allows several writing processes.
+    After a failure `path` is unchanged. `temporary_base` is another base of the temporary name;
+    `shared` allows several writing processes.
     """
-    place, ending = aside or path, uuid4().hex if shared else "unfinished"
+    place, ending = temporary_base or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
     try:
         with wrap_write_errors(path):
@@ -79,14 +79,14 @@ def write_picture(path: Path, figure: Figure, **options: Any) -> None:
 
 
 def write_table(
-    path: Path, table: pl.DataFrame, *, aside: Path | None = None, **options: Any
+    path: Path, table: pl.DataFrame, *, temporary_base: Path | None = None, **options: Any
 ) -> None:
     """Write CSV, or Parquet for other extensions; pass `options` to polars."""
     import polars as pl
 
     refuse_polars_in_forked_process()
     write = table.write_csv if path.suffix == ".csv" else table.write_parquet
-    with replace_file_on_success(path, aside=aside) as temporary:
+    with replace_file_on_success(path, temporary_base=temporary_base) as temporary:
         try:
             write(temporary, **options)
         except pl.exceptions.ComputeError as error:  # raised by polars for a full disk
@@ -95,38 +95,40 @@ def write_table(
 
 @contextmanager
 def output_folder(
-    out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
+    out: Path, completion_file: str = "summary.json", *, valid_after_failure: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when the file `last` exists.
+    """Create a command's output folder; the output is complete when `completion_file` exists.
 
-    `kept` are names of earlier files that remain valid after a failure.
+    `valid_after_failure` are names of earlier files that remain valid after a failure.
     """
     make_folder(out)
-    with wrap_write_errors(out / last):
-        (out / last).unlink(missing_ok=True)
+    with wrap_write_errors(out / completion_file):
+        (out / completion_file).unlink(missing_ok=True)
     before = _file_times_and_inodes(out)
     try:
         yield
     except CannotWrite as error:
         after = _file_times_and_inodes(out)
-        existing = [name for name in after if name in kept or before.get(name) != after[name]]
+        existing = [
+            name for name in after if name in valid_after_failure or before.get(name) != after[name]
+        ]
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
 
 
-def refuse_to_replace_inputs(result: Path, given: str | Path | None = None) -> None:
-    """Raise DrakeTeleopError if the file `result` would replace `given` or be in a drive's folder.
+def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -> None:
+    """Raise DrakeTeleopError if `path` would replace `input_path` or be in a drive's folder.
 
-    A `given` that is no file, such as a shipped name, is ignored.
+    An `input_path` that is no file, such as a shipped name, is ignored.
     """
-    if not result.exists():
+    if not path.exists():
         return
-    what = "a recorded drive" if (result.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
-    if given is not None and os.path.isfile(given) and os.path.samefile(given, result):
-        what = f"the input {result.name}"
+    what = "a recorded drive" if (path.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
+    if input_path is not None and os.path.isfile(input_path) and os.path.samefile(input_path, path):
+        what = f"the input {path.name}"
     if what:
         raise DrakeTeleopError(
             f"contains {what}, which the results would replace",
-            where=str(result.parent),
+            where=str(path.parent),
             remedy="give another --out",
         )
 

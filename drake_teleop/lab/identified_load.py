@@ -94,13 +94,13 @@ def _hash_source_files(package: Path, models: Path) -> str:
 _SOURCES_HASH = _hash_source_files(Path(__file__).parents[1], models_dir())
 
 
-def _cache_key(before: Scenario, detects: bool) -> str:
+def _cache_key(identification: Scenario, with_noise_floor: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES_IN_CACHE_KEY]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
-    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.model_files()]
-    what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
+    models = [sha256(path.read_bytes()).hexdigest() for path in identification.slave.model_files()]
+    what = (__version__, dataclasses.asdict(identification), with_noise_floor, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()
 
 

@@ -18,8 +18,8 @@ _PSEUDO_INERTIA_ROUNDING_TOLERANCE = 1e-12
 _MIN_SQUARED_GYRATION_RADIUS_M2 = 1e-290
 
 
-def _inertia_of_point_mass(about: Array, mass: float) -> Array:
-    return mass * (about @ about * np.eye(3) - np.outer(about, about))
+def _inertia_of_point_mass(p_com: Array, mass: float) -> Array:
+    return mass * (p_com @ p_com * np.eye(3) - np.outer(p_com, p_com))
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:

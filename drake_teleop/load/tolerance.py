@@ -104,12 +104,12 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
 
 
-def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
+def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
     """Return the standard deviations (k,) of numbers with a tolerance, divided by it."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
-    variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
-    is_undetermined = (errors[:, unknown] != 0.0).any(axis=1)
+    variances = np.einsum("ki,ij,kj->k", derivatives, finite, derivatives)
+    is_undetermined = (derivatives[:, unknown] != 0.0).any(axis=1)
     return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 

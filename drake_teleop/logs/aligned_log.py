@@ -67,19 +67,19 @@ def _estimate_motion_load_and_delay_source(
 
 
 def fit_motion_to_known_load(
-    log: Log, delay: str | float, load: Array, usual_s: float
+    log: Log, delay: str | float, coefficients: Array, fallback_delay_s: float
 ) -> tuple[PoseMotion, str] | None:
     """Return the motion from poses that fits an identified load best, and the delay's source.
 
-    `load` (6, 16) are the load's coefficients, Eq. (T73). The delay is `usual_s` [s] if the record
+    `coefficients` (6, 16) are the load's, Eq. (T73). The delay is `fallback_delay_s` if the record
     does not determine it. Return None for a short log, and without poses or if the IMU disagrees.
     """
     if log.posed is None or log.static:
         return None
-    fit = partial(fit_motion_to_load, load=load)
+    fit = partial(fit_motion_to_load, coefficients=coefficients)
     with suppress(DrakeTeleopError):  # too short
         found, source = _fit_with_fallback_delay_if_undetermined(
-            log, log.posed, delay, fit, usual_s, "load"
+            log, log.posed, delay, fit, fallback_delay_s, "load"
         )
         return (found, source) if found.is_imu_consistent_with_poses else None
     return None
@@ -90,15 +90,15 @@ def _fit_with_fallback_delay_if_undetermined(
     posed: PosesOfLog,
     delay: str | float,
     fit: Callable[..., _PoseMotionT],
-    usual_s: float,
-    usual: str,
+    fallback_delay_s: float,
+    fallback_source: str,
 ) -> tuple[_PoseMotionT, str]:
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W
     fit = partial(fit, *arrays, lost=log.bridged, imu=posed.imu)
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = fit(delay=known)
     if known is None and not found.delay_std_s < _MAX_KNOWN_DELAY_STD_S:
-        return fit(delay=usual_s), usual
+        return fit(delay=fallback_delay_s), fallback_source
     return found, source
 
 
@@ -154,7 +154,7 @@ class AlignedLog:
 def read_aligned_log(
     path: str | Path,
     phi: Array,
-    usual_s: float,
+    fallback_delay_s: float,
     cutoff_hz: float | None,
     delay: str | float,
     differentiate: bool,
@@ -163,14 +163,14 @@ def read_aligned_log(
     """Read a log and remove the delay between motion and wrench.
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    `delay` [s] or "auto" is removed; `usual_s` [s] is used if the record does not determine it.
+    `delay` [s] or "auto" is removed, or `fallback_delay_s` if the record does not determine it.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
     smooth = None
     coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
     with one_blas_thread():
-        found = fit_motion_to_known_load(log, delay, coefficients, usual_s)
+        found = fit_motion_to_known_load(log, delay, coefficients, fallback_delay_s)
     if found is not None:
         motion, source = found
         moved, one_sided = use_spline_motion_and_flag_edges(log, motion)
@@ -188,7 +188,7 @@ def read_aligned_log(
     log = replace_specific_force_by_acceleration(log) if weight_removed else log
     delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
-        delay_s, source = usual_s, "load"
+        delay_s, source = fallback_delay_s, "load"
     log = remove_delay(log, delay_s)
     other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
     candidates = [other] if smooth is None else [smooth, other]
@@ -327,10 +327,10 @@ def _physically_consistent_theta(found: PoseEstimate) -> Array:
     return consistent_least_squares(gram, gram @ theta, theta)
 
 
-def _note_on_disturbances_clock_and_misfit(found: PoseEstimate, stated: float) -> str:
+def _note_on_disturbances_clock_and_misfit(found: PoseEstimate, gain_std: float) -> str:
     notes = [*([found.note] if found.note else []), *_clock_rate_notes(found)]
     if not found.fit.is_explained_by_gains:
-        gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
+        gains = f"gains beyond {gain_std:g}, " if gain_std else "gains (state wrench.gain_std), "
         notes.append(
             f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
             f" S; deviations are {found.fit.std_inflation_by_misfit:.2g} times as large as by noise"

@@ -92,7 +92,7 @@ def detect_contact(
     dt: float,
     cutoff_hz: float | None,
     covariance: Array,
-    usual: Array,
+    residual_rms: Array,
     *,
     edge: NDArray[np.bool_] | None = None,
     free: tuple[DetectorSamples, float] | None = None,
@@ -101,8 +101,8 @@ def detect_contact(
     """Find contact in a log; return None for fewer than 100 judged samples.
 
     Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
-    `covariance` (16, 16) is that of [offsets; phi], `usual` (6,) the RMS residual of the
-    identification [N, N m]. `free` is a log of free motion, and its sample time [s].
+    `covariance` (16, 16) is that of [offsets; phi], `residual_rms` (6,) that of the identification
+    [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
     period = 1.0 / (cutoff_hz or _CUTOFF_WITHOUT_LOW_PASS_HZ)
     inner = _rows_far_from_ends_and_edges(rows, dt, period, edge)
@@ -135,7 +135,7 @@ def detect_contact(
         free_duration_s=len(train.contact) * (dt if free is None else free[1]),
         force_threshold=THRESHOLD_OVER_MAX
         * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
-        notes=() if free is not None else _notes_if_mostly_contact(floor, touched, usual),
+        notes=() if free is not None else _notes_if_mostly_contact(floor, touched, residual_rms),
     )
 
 
@@ -221,7 +221,7 @@ def _remove_marginal_contacts(
 
 
 def _notes_if_mostly_contact(
-    floor: NoiseFloor, touched: NDArray[np.bool_], usual: Array
+    floor: NoiseFloor, touched: NDArray[np.bool_], residual_rms: Array
 ) -> tuple[str, ...]:
     remedy = "; give a log of free motion with --free"
     if touched.mean() > _MAX_CONTACT_SHARE:
@@ -229,7 +229,7 @@ def _notes_if_mostly_contact(
             f"{100 * touched.mean():.0f} % of the record are contact: the rest is too short to"
             f" determine the noise floor{remedy}",
         )
-    noise_ratio = float((floor.noise / np.maximum(usual, _MIN_NOISE_FLOOR)).max())
+    noise_ratio = float((floor.noise / np.maximum(residual_rms, _MIN_NOISE_FLOOR)).max())
     if noise_ratio > _MAX_NOISE_FLOOR_OVER_FIT_RESIDUAL:
         return (
             f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"

@@ -139,7 +139,7 @@ class TableSink:
             remove_log(self._path)
         if self._path.suffix == ".parquet":
             make_folder(self._path)
-            write_table(log_part_path(self._path, self._written), table, aside=self._path)
+            write_table(log_part_path(self._path, self._written), table, temporary_base=self._path)
         else:
             text = table.write_csv(include_header=not self._written).encode()
             mode = "r+b" if self._written else "wb"

@@ -220,12 +220,14 @@ class SimulationResult:
         """
         self._write_parquet_file(Path(path))
 
-    def _write_parquet_file(self, path: Path, aside: Path | None = None) -> None:
+    def _write_parquet_file(self, path: Path, temporary_base: Path | None = None) -> None:
         specs = [asdict(spec) for spec in self.specs]
         # Fixed row groups: polars' default may depend on the number of threads.
         metadata = {_SIGNAL_METADATA_KEY: json.dumps(specs)}
         table = self.to_dataframe()
-        write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
+        write_table(
+            path, table, temporary_base=temporary_base, metadata=metadata, row_group_size=2**16
+        )
 
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
@@ -239,7 +241,7 @@ class SimulationResult:
         part = log_part_path(folder, first_row)
         if len(self.t) or not part.exists():
             make_folder(folder)
-            self._write_parquet_file(part, aside=folder)
+            self._write_parquet_file(part, temporary_base=folder)
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:

@@ -56,13 +56,13 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
 
 
 def _summarise_runs_of_method(
-    runs: Sequence[Mapping[str, Any]], leaked_by_hands: float
+    runs: Sequence[Mapping[str, Any]], leaked_J_in_release_and_taps: float
 ) -> MethodResult:
     if not all(run["stable"] for run in runs):
         return MethodResult(
             VERDICT_UNSTABLE, motion_texts=tuple(map(_describe_motion_in_hold, runs))
         )
-    leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
+    leaked = max(leaked_J_in_release_and_taps, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_POSITION_ERROR_M:
         return MethodResult(VERDICT_POSITION_ERROR, forces, leaked_J=leaked)

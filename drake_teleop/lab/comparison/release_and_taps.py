@@ -80,9 +80,11 @@ def _intended_tap_motion(rate: float, round_trip: float) -> Array:
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
-def _displayed_tap_impulse_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
+def _displayed_tap_impulse_share(
+    run: OneDofRun, scale: float, rate: float, one_way_delay_s: float
+) -> float:
     first = int(np.argmax(run.wall_force < 0.0))
     second = first + round(0.75 / rate / PERIOD)  # between first and second contact
     pressed = scale * run.wall_force[second:].sum()
-    felt = run.hand_force[second + round(way / PERIOD) :].sum()
+    felt = run.hand_force[second + round(one_way_delay_s / PERIOD) :].sum()
     return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0

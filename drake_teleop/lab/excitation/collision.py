@@ -278,13 +278,15 @@ class CollisionScene:
         return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
-def _required_capsule_distance(of_shapes: Array, capsules_apart: Array) -> float:
+def _required_capsule_distance(shape_distances: Array, capsules_apart: Array) -> float:
     # Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
-    touching = (of_shapes > _NEAR_CONTACT_GAPS_M[0]) & (of_shapes < _NEAR_CONTACT_GAPS_M[1])
+    touching = (shape_distances > _NEAR_CONTACT_GAPS_M[0]) & (
+        shape_distances < _NEAR_CONTACT_GAPS_M[1]
+    )
     excess = np.zeros(1)
     if touching.sum() >= _MIN_POSTURES_NEAR_CONTACT:
-        excess = (of_shapes - capsules_apart)[touching]
-    free = capsules_apart[of_shapes > MIN_CLEARANCE_M]
+        excess = (shape_distances - capsules_apart)[touching]
+    free = capsules_apart[shape_distances > MIN_CLEARANCE_M]
     return float(
         min(
             MIN_CLEARANCE_M - np.quantile(excess, _CAPSULE_EXCESS_QUANTILE),

@@ -120,11 +120,11 @@ def excite(
 def assemble_excitation(
     robot: Robot,
     criterion: str,
-    found: list[FeasibleIterate],
+    iterates: list[FeasibleIterate],
     trajectory: FourierTrajectory,
     uses: list[LimitUse],
 ) -> Excitation:
-    best = accumulate((iterate.criterion_value for iterate in found), min)
+    best = accumulate((iterate.criterion_value for iterate in iterates), min)
     return Excitation(
         robot,
         trajectory,
@@ -138,24 +138,24 @@ def assemble_excitation(
         ),
         uses,
         np.array(
-            [(it.num_evaluations, value) for it, value in zip(found, best, strict=True)]
+            [(it.num_evaluations, value) for it, value in zip(iterates, best, strict=True)]
         ).reshape(-1, 2),
-        found[-1].cpu_time_s if found else 0.0,
+        iterates[-1].cpu_time_s if iterates else 0.0,
     )
 
 
 def find_best_within_limits(
     robot: Robot,
-    found: list[FeasibleIterate],
+    iterates: list[FeasibleIterate],
     progress: Callable[[float], None] = lambda done: None,
-    others: Iterable[FourierTrajectory] = (),
+    fallback_trajectories: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
     """Return the best trajectory that passes the check, and its uses of the limits.
 
-    If none of `found` passes, `others` are checked in their order.
+    If none of `iterates` passes, `fallback_trajectories` are checked in their order.
     """
     worst: LimitUse | None = None
-    for trajectory in chain(_feasible_candidates(found, robot), others):
+    for trajectory in chain(_feasible_candidates(iterates, robot), fallback_trajectories):
         uses = check_trajectory(robot, trajectory, progress)
         if uses[0].used_share <= 1:
             return trajectory, uses
@@ -192,8 +192,10 @@ def trajectory_sensor_motion(
     return s, omega, alpha
 
 
-def _feasible_candidates(found: list[FeasibleIterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    ranked = sorted(found, key=lambda iterate: iterate.criterion_value)
+def _feasible_candidates(
+    iterates: list[FeasibleIterate], robot: Robot
+) -> Iterator[FourierTrajectory]:
+    ranked = sorted(iterates, key=lambda iterate: iterate.criterion_value)
     last = dict.fromkeys((iterate.start_index for iterate in ranked), 0.0)
     checks = 0
     for iterate in ranked:
@@ -211,9 +213,9 @@ def _feasible_candidates(found: list[FeasibleIterate], robot: Robot) -> Iterator
 
 
 def _shrinking_motions_about_start_posture(
-    robot: Robot, found: list[FeasibleIterate], problem: DesignProblem, seed: int
+    robot: Robot, iterates: list[FeasibleIterate], problem: DesignProblem, seed: int
 ) -> Iterator[FourierTrajectory]:
-    best = sorted(found, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
+    best = sorted(iterates, key=lambda iterate: iterate.criterion_value)[:_NUM_FALLBACK_MOTIONS]
     motions = [iterate.trajectory for iterate in best]
     rng = np.random.default_rng(seed)
     random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_FALLBACK_MOTIONS))

@@ -75,10 +75,10 @@ def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
 
 
 @njit(cache=True)
-def add_torque_to_seeds(table, motions, c, virtual, seeds):
+def add_torque_to_seeds(table, motions, c, virtual_velocities, seeds):
     """Add to `seeds` the gradients of c . tau; torques tau exclude rotor inertia and damping.
 
-    Write the link velocities for joint velocities c into `virtual` (n+1, 6).
+    Write the link velocities for joint velocities c into `virtual_velocities` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
@@ -93,8 +93,8 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
                 v = plus(v, along)
             else:
                 w = plus(w, along)
-        virtual[row, 0], virtual[row, 1], virtual[row, 2] = v
-        virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
+        virtual_velocities[row, 0], virtual_velocities[row, 1], virtual_velocities[row, 2] = v
+        virtual_velocities[row, 3], virtual_velocities[row, 4], virtual_velocities[row, 5] = w
         v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
         s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
         alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_IN_SEED))
@@ -110,10 +110,10 @@ def add_torque_to_seeds(table, motions, c, virtual, seeds):
 
 
 @njit(cache=True)
-def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
+def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
     """Add to `g_q`, `g_qd`, `g_qdd` (n,) the gradients that follow from the seeds of all links.
 
-    `c` and `virtual` are those of `add_torque_to_seeds`, or zeros.
+    `c` and `virtual_velocities` are those of `add_torque_to_seeds`, or zeros.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)
@@ -147,7 +147,7 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd
         turned, gr = cross(gs, w), gp
         if row > 0:
             gr = plus(gp, plus(cross(gs, a), cross(turned, w)))
-            gr = plus(gr, cross(gv, vector_at(virtual[row - 1], 3)))
+            gr = plus(gr, cross(gv, vector_at(virtual_velocities[row - 1], 3)))
         if row < n and slides:
             g_q[row] += dot(z, gr)
         if row > 0:

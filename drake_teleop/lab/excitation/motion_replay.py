@@ -34,8 +34,8 @@ _LINK_RADIUS_TO_LENGTH = 0.04  # radius of a bone over its length
 _CAMERA_OFFSET_IN_ARM_SIZES = np.array([0.55, -0.75, 0.3])
 
 
-def write_motion_replay(path: Path, found: Excitation) -> None:
-    robot, trajectory = found.robot, found.trajectory
+def write_motion_replay(path: Path, excitation: Excitation) -> None:
+    robot, trajectory = excitation.robot, excitation.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
     root = robot.scene.diagram.CreateDefaultContext()

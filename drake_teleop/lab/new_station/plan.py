@@ -151,14 +151,14 @@ def plan_station(
 
 
 def _find_start_and_tool_axis(
-    slave: Slave, shapes: PostureShapes, plane: float, natural: str
+    slave: Slave, shapes: PostureShapes, plane: float, natural_axis: str
 ) -> tuple[StartPlace, str, PostureShapes]:
     # The start, the tool's axis of S, and the shapes; a stand-in tool is set along that axis.
     found: list[tuple[StartPlace, str, PostureShapes]] = []
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
-    for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
-        if axis == OPPOSITE_AXIS[natural] and axis != "z":
+    for axis in dict.fromkeys((natural_axis, "z", *TOOL_AXES)):
+        if axis == OPPOSITE_AXIS[natural_axis] and axis != "z":
             continue
         if is_stand_in:
             slave.tool = _stand_in_tool(axis, _stand_in_length(shapes, axis))
@@ -218,14 +218,14 @@ def _stand_in_length(shapes: PostureShapes, axis: str) -> float:
 
 
 def _without_weak_torque_limits(
-    arm: ArmModel, q: Array, share: float
+    arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
     """Return the arm without torque limits too low to hold it at q, their joints, and texts.
 
     Args:
-        share: share of the load that the arm must hold.
+        load_share: share of the load that the arm must hold.
     """
-    torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
+    torque = np.abs(holding_torque(arm.with_load(load_share * arm.phi_load), q))
     weak = torque > MAX_HOLDING_TORQUE_USE * arm.effort_limit
     names = tuple(np.array(arm.joint_names)[weak].tolist())
     texts = [

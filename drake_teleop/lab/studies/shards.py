@@ -77,10 +77,10 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         )
 
 
-def _link_or_copy_file(part: Path, path: Path, aside: Path) -> None:
+def _link_or_copy_file(part: Path, path: Path, temporary_base: Path) -> None:
     if path.exists():
         return
-    with replace_file_on_success(path, aside=aside) as temporary:
+    with replace_file_on_success(path, temporary_base=temporary_base) as temporary:
         try:
             os.link(part, temporary)
         except OSError:  # a file system without links

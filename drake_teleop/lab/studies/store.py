@@ -46,7 +46,9 @@ class Store:
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        write_table(self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, aside=self.folder)
+        write_table(
+            self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, temporary_base=self.folder
+        )
 
     def count_chunk_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""

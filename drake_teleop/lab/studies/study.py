@@ -121,7 +121,7 @@ def study_command(
     )  # fmt: skip
     summary = _summarise_measures(study, rows)
     out = parse_shard(shard).folder(out) if shard else out
-    with output_folder(out, kept=["runs.parquet"]):
+    with output_folder(out, valid_after_failure=["runs.parquet"]):
         if not shard:
             from drake_teleop.lab.studies.pictures import write_pictures
 

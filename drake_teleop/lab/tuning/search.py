@@ -199,7 +199,9 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     return execute
 
 
-def _add_predicted_threshold(row: Row, trial: StationPressTrial, noises: dict[float, float]) -> Row:
+def _add_predicted_threshold(
+    row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
+) -> Row:
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
     human, scale = (
         trial.base_scenario.operator.perception,
@@ -207,7 +209,7 @@ def _add_predicted_threshold(row: Row, trial: StationPressTrial, noises: dict[fl
     )
     masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
-    noise = 2 * noises[row["low_pass_hz"]] * gamma
+    noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma
     rendered = scale * gamma * row["share"]
     threshold = (smallest + noise) / rendered if rendered > 0.0 else np.inf
     return row | {"gamma": gamma, "threshold_N": float(threshold)}

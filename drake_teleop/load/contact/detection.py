@@ -51,11 +51,11 @@ CONTACT_END_LEVEL = 0.7 * NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES
 
 @njit(cache=True)
 def update_statistics(
-    memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
+    memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet_level
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
 
-    `memory` (MEMORY_SIZE,) is zero at the start; `quiet` is CONTACT_END_LEVEL.
+    `memory` (MEMORY_SIZE,) is zero at the start; `quiet_level` is CONTACT_END_LEVEL.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -82,7 +82,7 @@ def update_statistics(
         length += memory[CUSUM_START + i] * memory[CUSUM_START + i]
         memory[INNOVATION_SUM_START + i] += e
     level, length = math.sqrt(level), math.sqrt(length)
-    if level < quiet:
+    if level < quiet_level:
         for c in range(6):
             memory[MEAN_START + c] += following * (contact[c] - memory[MEAN_START + c])
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
@@ -110,12 +110,12 @@ def update_statistics(
 
 
 @njit(cache=True)
-def _statistics_of_rows(rows, parameters, slack, following, quiet, out):
+def _statistics_of_rows(rows, parameters, slack, following, quiet_level, out):
     contact, s, omega, alpha, acceleration = rows
     memory = np.zeros(MEMORY_SIZE)
     for k in range(contact.shape[0]):
         sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
-        update_statistics(memory, *sample, parameters, slack, following, quiet)
+        update_statistics(memory, *sample, parameters, slack, following, quiet_level)
         out[k] = memory[STATISTICS_START : STATISTICS_START + 3]
 
 

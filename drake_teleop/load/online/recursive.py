@@ -34,11 +34,10 @@ _MIN_ROW_VARIANCE_OVER_TERMS = 1e-10
 
 
 @njit(cache=True)
-def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
+def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual_square_sums):
     """Update estimate theta (16,) and covariance P (16, 16) by N samples, without checks.
 
-    `largest` (16,) limits the variances during forgetting; `squares` (6,) are the sums of squared
-    residuals.
+    `max_variances` (16,) limits the variances during forgetting; `residual_square_sums` is (6,).
     """
     V, gain = np.empty((6, 10)), np.empty(16)
     step = 1.0 / math.sqrt(forgetting)
@@ -46,12 +45,12 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
         sample = samples[n]
         if forgetting < 1.0:
             for i in range(16):
-                gain[i] = max(1.0, min(step, math.sqrt(largest[i] / P[i, i])))
+                gain[i] = max(1.0, min(step, math.sqrt(max_variances[i] / P[i, i])))
             for i in range(16):
                 for j in range(16):
                     P[i, j] *= gain[i] * gain[j]
             for c in range(6):
-                squares[c] *= forgetting
+                residual_square_sums[c] *= forgetting
 
         wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
         regressor_into(motion[:3], motion[3:6], motion[6:], V)
@@ -73,7 +72,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             variance = max(noise_std[c] * noise_std[c], _MIN_ROW_VARIANCE_OVER_TERMS * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
-            squares[c] += variance * innovation * share
+            residual_square_sums[c] += variance * innovation * share
             for i in range(16):
                 theta[i] += gain[i] * share
                 # (a b) c equals (b a) c to the last bit, so P stays symmetric.

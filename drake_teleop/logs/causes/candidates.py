@@ -65,13 +65,13 @@ class Candidate:
     score: float
 
 
-def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
+def fit_candidates(state: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
     """Fit a model with each further extension, and yield those with sufficient effect.
 
-    `first` is True in the first round of the search.
+    `is_first_round` is True in the first round of the search.
     """
     model, data = state.model, state.data
-    if first:
+    if is_first_round:
         yield from _axis_permutation_candidates(state)
     if data.gravity_W is not None:
         if "gravity" not in model.extensions:
@@ -85,7 +85,7 @@ def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
     for kind in ("offsets", "load"):
         found = add_step(state, kind)
         if found is not None:
-            yield _scored_candidate(kind, state, found, times=1)
+            yield _scored_candidate(kind, state, found, num_times=1)
     if not {"linear drift", "drift"} & set(model.extensions):
         yield from _fit_extension(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
@@ -98,7 +98,7 @@ def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
         yield from _fit_extension(
             state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _MIN_POSE_SHIFT_M
         )
-    if first and not model.extensions:
+    if is_first_round and not model.extensions:
         angle = np.radians(_MIN_SENSOR_ROTATION_DEG)
         yield from _fit_extension(
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
@@ -107,7 +107,7 @@ def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
     if spans and spans != state.contact_spans:
         larger = FittedModel.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
-        yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
+        yield _scored_candidate("contact", state, larger, num_extra=6 + 2 * ends)
     if data.has_positions and "cable" not in model.extensions and data.accelerates_enough:
         yield from _fit_extension(state, "cable", [None], lambda _: True)
     if "drift" not in model.extensions and "linear drift" not in model.extensions:
@@ -115,13 +115,13 @@ def fit_candidates(state: FittedModel, first: bool) -> Iterator[Candidate]:
 
 
 def _scored_candidate(
-    name: str, state: FittedModel, larger: FittedModel, *, times: int = 0, more: int = 0
+    name: str, state: FittedModel, larger: FittedModel, *, num_times: int = 0, num_extra: int = 0
 ) -> Candidate:
     rows = float(state.data.used.sum())
-    cost = larger.model.size - state.model.size + more
+    cost = larger.model.size - state.model.size + num_extra
     score = 2.0 * (larger.likelihood - state.likelihood) - cost * np.log(rows)
-    if times:
-        score += (0.5 * cost - 2.0 * times) * np.log(rows)
+    if num_times:
+        score += (0.5 * cost - 2.0 * num_times) * np.log(rows)
     return Candidate(name, larger, float(score))
 
 
@@ -275,7 +275,7 @@ def _torque_factor_candidates(state: FittedModel) -> Iterator[Candidate]:
     far = not _MIN_USUAL_TORQUE_FACTOR < best.model.torque_factor < 1.0 / _MIN_USUAL_TORQUE_FACTOR
     most = _MAX_EXTREME_TORQUE_FACTOR_ERROR if far else _MAX_TORQUE_FACTOR_ERROR
     limit = min(_TORQUE_FACTOR_MARGIN + 4.0 * np.sqrt(covariance[0, 0]), most)
-    found = _scored_candidate("torque factor", state, best, more=1)
+    found = _scored_candidate("torque factor", state, best, num_extra=1)
     # A factor beside the known ratios is not a cause, but widens the intervals.
     score = (
         found.score
@@ -327,7 +327,7 @@ def _axis_permutation_candidates(state: FittedModel) -> Iterator[Candidate]:
     if best[0] < _MAX_RESIDUAL_SHARE_OF_PERMUTATION * plain:
         larger = state.refit(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
-            found = _scored_candidate("axes", state, larger, more=3)
+            found = _scored_candidate("axes", state, larger, num_extra=3)
             # The given axes imply a negative mass, which is impossible.
             more = _SCORE_OF_AVOIDED_NEGATIVE_MASS if has_negative_inertia(state) else 0.0
             yield replace(found, score=found.score + more)

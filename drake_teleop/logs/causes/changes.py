@@ -156,11 +156,11 @@ def _squared_step_over_variance(state: FittedModel, i: int) -> float:
 def _estimate_ramp_middle(
     state: FittedModel,
     kinds: Sequence[Sequence[str]],
-    first: int,
+    first_added_step: int,
     k: int,
     span: tuple[float, float],
 ) -> float:
-    data, at = state.data, first + sum(len(both) for both in kinds[:k])
+    data, at = state.data, first_added_step + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
     rows = np.flatnonzero(data.used & is_in_time_spans(data, (span,)))
     if not len(rows):

@@ -155,7 +155,7 @@ def _search_causes_from(
         if residual_is_noise(state):
             return state, delay_s, []
         found = _remove_cable_if_weight_explains_as_much(
-            list(fit_candidates(state, first=number == 0))
+            list(fit_candidates(state, is_first_round=number == 0))
         )
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_misfit_reduced(x, state)]

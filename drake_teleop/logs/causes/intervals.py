@@ -33,20 +33,20 @@ _MAX_PLAUSIBLE_GAIN_STD = 0.025
 
 
 def load_covariance(
-    state: FittedModel, rejected: Sequence[Candidate], blocks: Array, gains: Array
+    state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
     out = state.covariance[OFFSETS_AND_LOAD, OFFSETS_AND_LOAD].copy()
     deviations = np.sqrt(np.diag(out))
-    factor = widening_factor_by_misfit(state, blocks)
-    squares = np.maximum(factor * deviations, blocks) ** 2
+    factor = widening_factor_by_misfit(state, jackknife_std)
+    squares = np.maximum(factor * deviations, jackknife_std) ** 2
     squares = squares + _load_variances_by_rejected_causes(state, rejected)
     ratio = np.sqrt(squares) / deviations
-    return np.asarray(out * np.outer(ratio, ratio) + gains)
+    return np.asarray(out * np.outer(ratio, ratio) + gain_covariance)
 
 
 def load_deviations_if_unexplained(
-    state: FittedModel, rejected: Sequence[Candidate], blocks: Array, gains: Array
+    state: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
     """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause.
 
@@ -56,10 +56,12 @@ def load_deviations_if_unexplained(
     if state.residual_ratio > _LARGE_RESIDUAL_RATIO:
         least = _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
     if state.smooth_misfit > least:
-        blocks = blocks * (1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT))
+        jackknife_std = jackknife_std * (
+            1.0 + _WIDENING_BY_MISFIT * (state.smooth_misfit - GOOD_SMOOTH_MISFIT)
+        )
     lasting = [x for x in rejected if x.name not in _CAUSES_IN_JACKKNIFE]
-    variance = blocks**2 + _load_variances_by_rejected_causes(state, lasting) + np.diag(gains)
-    return np.asarray(np.sqrt(variance))
+    variance = jackknife_std**2 + _load_variances_by_rejected_causes(state, lasting)
+    return np.asarray(np.sqrt(variance + np.diag(gain_covariance)))
 
 
 def _load_variances_by_rejected_causes(state: FittedModel, rejected: Sequence[Candidate]) -> Array:
@@ -132,13 +134,13 @@ def load_bias_by_alpha_noise(state: FittedModel) -> Array:
     return np.asarray((state.covariance @ right)[OFFSETS_AND_LOAD])
 
 
-def widening_factor_by_misfit(state: FittedModel, blocks: Array) -> float:
+def widening_factor_by_misfit(state: FittedModel, jackknife_std: Array) -> float:
     """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.covariance)[OFFSETS_AND_LOAD])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
-        spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
+        spread = float(np.sqrt(np.mean((jackknife_std[shown] / deviations[shown]) ** 2)))
         factor = spread / _USUAL_JACKKNIFE_OVER_FIT if spread > _MAX_JACKKNIFE_OVER_FIT else 1.0
     if "cable" in state.model.extensions:
         factor *= _CABLE_WIDENING_FACTOR  # a spring models a cable only to first order

@@ -79,9 +79,9 @@ class Model:
     axes: Array = field(default_factory=lambda: np.eye(3))
     torque_factor: float = 1.0
 
-    def with_extension(self, part: str) -> Model:
+    def with_extension(self, name: str) -> Model:
         return (
-            self if part in self.extensions else replace(self, extensions=(*self.extensions, part))
+            self if name in self.extensions else replace(self, extensions=(*self.extensions, name))
         )
 
     @cached_property
@@ -126,13 +126,13 @@ class Model:
     def step_times(self) -> tuple[float, ...]:
         return tuple(step.time for step in self.steps)
 
-    def start_parameters(self, x: Array, of: Model) -> Array:
-        """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
+    def start_parameters(self, x: Array, other_model: Model) -> Array:
+        """Return parameters (size,) from those of `other_model`, x; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
         for name, where in self.parameter_slices.items():
-            if name in of.parameter_slices:
-                out[where] = x[of.parameter_slices[name]]
+            if name in other_model.parameter_slices:
+                out[where] = x[other_model.parameter_slices[name]]
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:

@@ -78,10 +78,10 @@ class UsedRows:
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise_filters_and_power(
-        self, residual: Array, floor: Array, order: int = MAX_NOISE_LAG
+        self, residual_coefficients: Array, floor: Array, order: int = MAX_NOISE_LAG
     ) -> tuple[Array, Array]:
         """Return whitening filters (6, 5) and noise power (6,) for coefficients of the residual."""
-        e = self.y @ residual.T
+        e = self.y @ residual_coefficients.T
         filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
         history = np.stack(
@@ -97,8 +97,8 @@ class UsedRows:
         power = products[:, 0, 0] + (filters[:, 1:] * products[:, 0, 1:]).sum(axis=1)
         return filters, np.maximum(power, floor)
 
-    def residual_rms(self, residual: Array) -> Array:
-        e = self.y @ residual.T
+    def residual_rms(self, residual_coefficients: Array) -> Array:
+        e = self.y @ residual_coefficients.T
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 

@@ -195,7 +195,7 @@ def check_wrench_and_estimate_delay(
 
 
 def _edits_with_far_better_fit(
-    fitted: Callable[[Description], LoadFitQuality],
+    fit_description: Callable[[Description], LoadFitQuality],
     given: LoadFitQuality,
     edits: list[tuple[Finding | None, Description]],
 ) -> list[tuple[LoadFitQuality, Finding | None, Description]]:
@@ -205,7 +205,7 @@ def _edits_with_far_better_fit(
     """
     positive, negative = [], []
     for finding, edited in edits:
-        fit = call_or_none_if_unreadable(fitted, edited)
+        fit = call_or_none_if_unreadable(fit_description, edited)
         if fit is None:
             continue
         if fit.mass > 0:

@@ -133,17 +133,17 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     )
 
 
-def _mean_specific_forces_in_start_axes(log: Log, P: Array) -> Array:
+def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
     """Return mean specific forces (2, n, 3) in n Hann windows, and half a window later.
 
-    The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
+    The gyroscope, its axes permuted by `gyro_axes`, rotates them to the axes at the window's start.
     """
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_GRAVITY_WINDOW_RANGE_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
     starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_GRAVITY_WINDOWS)).astype(int)
     take = starts[:, None] + np.arange(3 * half)
-    omega, s = log.angular_velocity[take] @ P.T, log.specific_force[take]
+    omega, s = log.angular_velocity[take] @ gyro_axes.T, log.specific_force[take]
     steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
     steps = steps.reshape(*omega.shape, 3)
     weight = np.zeros((2, 3 * half))
@@ -156,8 +156,8 @@ def _mean_specific_forces_in_start_axes(log: Log, P: Array) -> Array:
     return means
 
 
-def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
-    means = _mean_specific_forces_in_start_axes(log, P) / gravity
+def _gravity_misfit(log: Log, gyro_axes: Array, gravity: float) -> float:
+    means = _mean_specific_forces_in_start_axes(log, gyro_axes) / gravity
     if means.shape[1] == 0:
         return np.nan
     off = np.linalg.norm(means, axis=2) - 1.0

@@ -60,18 +60,18 @@ class LogData:
         return read_described_log(description, self._source, tables=self._thinned)
 
     def start_lag_and_clock_drift_correction(
-        self, name: str, description: Description, late: float, drift: float
+        self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
         """Return a stream's lag at its first row [s], lines to set, and the edited description.
 
-        The clock of stream `name` lags by `late` [s] at the first row of the wrench, and by
+        The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row, and by
         `drift` [s/s] more each second.
         """
         time = getattr(description, name).time
         start = self._start_time_of_stream(getattr(description, name))
         start -= self._start_time_of_stream(description.wrench)
         scale = 1.0 / (1.0 + drift)
-        lag = scale * (late + drift * start)
+        lag = scale * (lag_at_wrench_start_s + drift * start)
         offset, factor = time.offset - lag, scale * time.scale
         edited = edit_field(description, f"{name}.time.offset", offset)
         lines = f"{name}.time.offset: {offset:.3f} and {name}.time.scale: {factor:.6f}"

@@ -30,15 +30,15 @@ class EpisodeFault(NamedTuple):
 
 
 def name_faults(
-    x: WrenchHypothesis, usual_lag: float, known: Array, fps: float
+    x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
     """Return the faults of an episode that a hypothesis contains.
 
-    `usual_lag` [frames] is that of other episodes, `known` (10,) the usual load.
+    `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """
     if x.phi is not None:
         mass = float(x.phi[0])
-        text = f"the load is another one: {mass:.3g} kg instead of {known[0]:.3g} kg"
+        text = f"the load is another one: {mass:.3g} kg instead of {usual_phi[0]:.3g} kg"
         return [EpisodeFault("tool changed", text, x.phi.tolist())]
     found = []
     if x.kind == "base":

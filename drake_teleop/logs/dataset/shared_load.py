@@ -126,11 +126,11 @@ def _excess_spread_over_own_loads(
 
 
 def _faultless_hypothesis_at_best_lag(
-    signals: EpisodeSignals, phi: Array, near: float
+    signals: EpisodeSignals, phi: Array, near_lag: float
 ) -> tuple[WrenchHypothesis, Array]:
     """Return the hypothesis without fault at the best lag near one [frames], and its residual."""
-    search = HypothesisSearch(signals, phi, near, _MIN_RESIDUAL_HALF_WIDTH)
-    lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
+    search = HypothesisSearch(signals, phi, near_lag, _MIN_RESIDUAL_HALF_WIDTH)
+    lags = near_lag + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
     found = (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags)
     best = min(found, key=lambda x: x.spread.sum())
     return best, search.unexplained_reading(best)

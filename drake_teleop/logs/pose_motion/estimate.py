@@ -208,7 +208,7 @@ def fit_motion_to_load(
     wrench: ArrayLike,
     poses: Poses,
     gravity_W: ArrayLike,
-    load: Array,
+    coefficients: Array,
     *,
     delay: float | None = None,
     lost: NDArray[np.bool_] | None = None,
@@ -219,7 +219,7 @@ def fit_motion_to_load(
         motion, last, _ = _find_splines_and_delay(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
             fewest=_MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD,
-            load=load,
+            load=coefficients,
         )
         known = delay is not None
         return replace(motion, delay_std_s=0.0 if known else delay_std(last))

@@ -394,10 +394,10 @@ def estimate_clock_rate_error(
     return best if 2.0 * (start - least) > _MIN_CLOCK_RATE_LIKELIHOOD_GAIN else 0.0
 
 
-def correct_clock_rate(poses: Poses, rate: float, grid: WrenchGrid, delay: float) -> Poses:
+def correct_clock_rate(poses: Poses, rate_error: float, grid: WrenchGrid, delay: float) -> Poses:
     """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
-    return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
+    return Poses(middle + (poses.t - middle) / (1.0 + rate_error), poses.position, poses.quaternion)
 
 
 def _clock_rate_step_and_likelihood_gain(spectra: Spectra) -> tuple[float, float]:

@@ -64,9 +64,9 @@ class ImuData:
         """Median rate [Hz]."""
         return float(1.0 / np.median(np.diff(self.t)))
 
-    def average_to_rate(self, fastest: float) -> ImuData:
-        """Return means of consecutive rows, at a rate of at least `fastest` [Hz]."""
-        count = max(1, int(self.rate / fastest))
+    def average_to_rate(self, min_rate_hz: float) -> ImuData:
+        """Return means of consecutive rows, at a rate of at least `min_rate_hz` [Hz]."""
+        count = max(1, int(self.rate / min_rate_hz))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
         whole = at[:, -1] - at[:, 0] < count / self.rate

@@ -40,12 +40,14 @@ def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool)
     return pairs
 
 
-def lag_of_imu_clock(t: Array, pairs: SignalPairs, t_imu: Array, reach: float, arm: Array) -> float:
+def lag_of_imu_clock(
+    t: Array, pairs: SignalPairs, t_imu: Array, reach: float, arm_effects: Array
+) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
-    The axes of the IMU may differ by any affine map. Effects linear in `arm` (N, k) are removed.
+    The axes of the IMU may differ by any affine map. The span of `arm_effects` (N, k) is removed.
     """
-    U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
+    U, singular, _ = np.linalg.svd(arm_effects - arm_effects.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
     def remove_arm_effects(x: Array) -> Array:

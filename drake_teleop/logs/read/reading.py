@@ -98,7 +98,7 @@ def read_log(
         table = read_table(path)
         description = describe_canonical(path, table)
         reader = _LogReader(description, str(path), bandwidth_hz, {path: table})
-        return reader.read_recording(keep_origin=True, differentiate=differentiate)
+        return reader.read_recording(keep_time_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise missing_topic_error(path)
     require_file(path)
@@ -133,9 +133,9 @@ class _LogReader:
         self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
-    def read_recording(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
+    def read_recording(self, *, keep_time_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
-            if keep_origin:
+            if keep_time_origin:
                 self._notes.append("each row is interpreted as a pose at rest")
             return self._read_static_poses(self._description.static)
         assert self._description.wrench is not None
@@ -167,7 +167,7 @@ class _LogReader:
             inertial = None if imu is None else imu.imu_data
             posed = self._description.poses_with_frame(pose.recorded_poses, inertial)
             log = replace(log, posed=posed)
-        log = log if keep_origin else log.with_times_relative_to(float(clock.t[0]))
+        log = log if keep_time_origin else log.with_times_relative_to(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
