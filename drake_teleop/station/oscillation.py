@@ -54,12 +54,12 @@ def reversal_indices(x: Array, swing: float) -> NDArray[np.intp]:
 
 
 def flag_unexplained_oscillation(
-    t: Array, command: Array, actual: Array, swing: float, near: float = MAX_REVERSAL_DELAY_S
+    t: Array, command: Array, actual: Array, swing: float, window: float = MAX_REVERSAL_DELAY_S
 ) -> Flags:
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
     An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
-    previous one. A reversal of the command excludes one of the motion within `near` [s].
+    previous one. A reversal of the command excludes one of the motion within `window` [s].
 
     Args:
         t: (N,) times [s].
@@ -68,7 +68,7 @@ def flag_unexplained_oscillation(
     commanded = np.sort(np.concatenate([t[reversal_indices(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_nearest_time_of_each_cause(t[reversal_indices(x, swing)], commanded, near)
+        times = remove_nearest_time_of_each_cause(t[reversal_indices(x, swing)], commanded, window)
         for series in split_times_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_OSCILLATION_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
@@ -76,17 +76,17 @@ def flag_unexplained_oscillation(
 
 
 def flag_unexplained_pose_oscillation(
-    t: Array, command: Array, actual: Array, near: float
+    t: Array, command: Array, actual: Array, window: float
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 
-    `near` [s] is that of `flag_unexplained_oscillation`.
+    `window` [s] is that of `flag_unexplained_oscillation`.
     """
     turned, wanted = (
         doubled_quaternions_with_reference_sign(pose, command) for pose in (actual, command)
     )
-    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, near)
-    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_SWING_RAD, near)
+    swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, window)
+    return swaying | flag_unexplained_oscillation(t, wanted, turned, _MIN_SWING_RAD, window)
 
 
 def pose_reversal_times(t: Array, pose: Array) -> Array:
@@ -108,11 +108,11 @@ def doubled_quaternions_with_reference_sign(pose: Array, reference: Array) -> Ar
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_nearest_time_of_each_cause(times: Array, causes: Array, near: float) -> Array:
-    """Remove, for each cause, the nearest event within `near` [s]; return the other times [s]."""
+def remove_nearest_time_of_each_cause(times: Array, causes: Array, window: float) -> Array:
+    """Remove, for each cause, the nearest event within `window` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
-        if len(times) and distances.min() < near:
+        if len(times) and distances.min() < window:
             times = np.delete(times, distances.argmin())
     return times
 
@@ -150,7 +150,7 @@ class Chatter(NamedTuple):
     stop: float
 
 
-def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
+def find_chatter(t: Array, force: Array, command_reversals: Array) -> list[Chatter]:
     """Return each long series of touches, without touches explained by reversals of the command.
 
     A series has 8 or more touches, at most 0.2 s apart, and lasts 0.3 s or longer.
@@ -158,10 +158,10 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
     Args:
         t: (N,) evenly spaced times [s].
         force: (N,) magnitude of the contact force [N].
-        reversals: times of the command's reversals [s].
+        command_reversals: times of the command's reversals [s].
     """
     touches = remove_nearest_time_of_each_cause(
-        _find_touches(t, force), reversals, _MAX_TOUCH_TO_REVERSAL_S
+        _find_touches(t, force), command_reversals, _MAX_TOUCH_TO_REVERSAL_S
     )
     found = []
     for series in split_times_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):

@@ -89,17 +89,17 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     ]
 
 
-def find_spans_closing_gaps(t: Array, happened: Flags, least: float = 0.0) -> Spans:
+def find_spans_closing_gaps(t: Array, happened: Flags, min_duration: float = 0.0) -> Spans:
     """Return the time spans (start, stop) [s] during which `happened` (N,) is true.
 
-    Gaps below 50 ms are closed; then spans shorter than `least` [s] are dropped.
+    Gaps below 50 ms are closed; then spans shorter than `min_duration` [s] are dropped.
     """
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
         if spans and start - spans[-1][1] < _MAX_CLOSED_SPAN_GAP_S:
             start = spans.pop()[0]
         spans.append((start, stop))
-    return [(start, stop) for start, stop in spans if stop - start >= least]
+    return [(start, stop) for start, stop in spans if stop - start >= min_duration]
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:

@@ -160,14 +160,14 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
 
 
 def _add_inverse_kinematics(
-    builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, led: bool
+    builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, follows_leader_joints: bool
 ) -> LeafSystem:
     arm = body.slave.arm
     make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
-    make_ik = LeaderJointFollower if led else make_ik
+    make_ik = LeaderJointFollower if follows_leader_joints else make_ik
     ik = make_ik(arm, body.slave.start, body.command_period_s)
     builder.AddNamedSystem("inverse_kinematics", ik)
-    if not led:
+    if not follows_leader_joints:
         builder.Connect(body.sample_ports["joint_position"], ik.GetInputPort("joint_position"))
     connect_ports(builder, ik, "joint_command", body.joint_control, "joint_command")
     builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))

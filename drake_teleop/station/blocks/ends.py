@@ -98,11 +98,11 @@ class PassivityAtMaster(_PassivityEndBlock):
         self._declare_output("wrench_to_master", 3, slice(0, 6))
 
     def _step_passivity_method(
-        self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
-        packet: Any,
+        self, inputs: Any, received: Any, fresh: bool, end_states: Any, _: Any,
+        port_energies: Any, wrench: Any, packet: Any,
     ) -> None:  # fmt: skip
-        work = ports[:2]
-        constants = *self._constants, ends, work, packet, wrench
+        work = port_energies[:2]
+        constants = *self._constants, end_states, work, packet, wrench
         step_master_end(self._method, *inputs, received, fresh, *constants)
 
 
@@ -136,10 +136,10 @@ class PassivityAtSlave(_PassivityEndBlock):
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
     def _step_passivity_method(
-        self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,
-        packet: Any,
+        self, inputs: Any, received: Any, fresh: bool, end_states: Any, pose: Any,
+        port_energies: Any, _: Any, packet: Any,
     ) -> None:  # fmt: skip
         *values, saturated, contact = inputs
         flags = bool(saturated[0] > 0.5), float(contact[0])
-        constants = *self._constants, ends, pose, ports, packet
+        constants = *self._constants, end_states, pose, port_energies, packet
         step_slave_end(self._method, *values, *flags, received, fresh, *constants)

@@ -76,14 +76,16 @@ def MakeJointTableAndRowBodies(
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
-def _joint_table_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+def _joint_table_row(
+    plant: MultibodyPlant, context: Context, joint: Joint, parent_row: int
+) -> Array:
     F = joint.frame_on_parent()
-    X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
+    X_PF = F.CalcPoseInWorld(context) if parent_row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _joint_type_and_axis(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     poses = [[*X.rotation().ToQuaternion().wxyz(), *X.translation()] for X in (X_PF, X_MB)]
-    return np.array([row, kind, *places, *axis, *poses[0], *poses[1]])
+    return np.array([parent_row, kind, *places, *axis, *poses[0], *poses[1]])
 
 
 def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:

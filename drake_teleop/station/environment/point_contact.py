@@ -65,14 +65,14 @@ def FindContactPairs(
     tool: Mapping[GeometryId, RigidTransform],
     environment: Iterable[ModelInstanceIndex],
     slip_speed: float,
-    moving: Sequence[int] = (),
+    row_bodies: Sequence[int] = (),
 ) -> ShapePairs:
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
         tool: pose X_SBody of its body, for each shape of the tool.
         slip_speed: sliding speed of full friction [m/s], the plant's stiction tolerance.
-        moving: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
+        row_bodies: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
 
     Raises:
         DrakeTeleopError: for an unbounded shape.
@@ -83,7 +83,7 @@ def FindContactPairs(
     monitoring_reason = ""
     touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
     for body in map(plant.get_body, touched):
-        row = moving.index(int(body.index())) if int(body.index()) in moving else -1
+        row = row_bodies.index(int(body.index())) if int(body.index()) in row_bodies else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
         direction = _prismatic_joint_direction_W(plant, context, body)
         for other in plant.GetCollisionGeometriesForBody(body):
@@ -176,15 +176,15 @@ def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -
 
 @njit(cache=True)
 def depth_of_sphere_in_box(
-    pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array
+    pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal_and_point: Array
 ) -> float:
     """Return the depth of a sphere in a box [m], below 0 if they are apart.
 
     Args:
         pair: (28,) row of `ShapePairs.compiled_pairs`.
         deflection: deflection of the sheet spring [m].
-        normal: (6,) output, written if they touch: direction out of the box in W (3), point of
-            contact in W [m] (3).
+        normal_and_point: (6,) output, written if they touch: direction out of the box in W
+            (3), point of contact in W [m] (3).
     """
     radius = pair[3]
     # Centre of the sphere relative to the box, in W.
@@ -210,17 +210,17 @@ def depth_of_sphere_in_box(
         return radius - distance
     # The normal in the box: from its nearest point, or through its nearest face.
     for i in range(3):
-        normal[3 + i] = 0.0
+        normal_and_point[3 + i] = 0.0
         beyond = abs(d[i]) - pair[16 + i]
         if (outside > 0.0 and beyond > 0.0) or (outside == 0.0 and i == face):
-            normal[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
-    n_W = apply_matrix(R_WBox, vector_at(normal, 3))
+            normal_and_point[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
+    n_W = apply_matrix(R_WBox, vector_at(normal_and_point, 3))
     # Halfway between the sphere's deepest point and the box's surface.
     inwards = (radius + distance) / 2
     for i in range(3):
-        normal[i] = n_W[i]
+        normal_and_point[i] = n_W[i]
         origin = pair[13 + i] + deflection * pair[19 + i] + w[i]
-        normal[3 + i] = origin - inwards * normal[i]
+        normal_and_point[3 + i] = origin - inwards * normal_and_point[i]
     return radius - distance
 
 
@@ -264,15 +264,16 @@ def _friction_coefficient(static: float, dynamic: float, slip_ratio: float) -> f
 
 @njit(cache=True)
 def point_contact_force_into(
-    pair: Array, x: float, normal: Array, velocity: Array, force: Array
+    pair: Array, depth: float, normal: Array, velocity: Array, force: Array
 ) -> None:
     """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
-    `pair` is a row of `ShapePairs.compiled_pairs`, `x` the depth [m], `normal` the direction out of
-    the box, `velocity` that of the sphere at the contact, relative to the box [m/s].
+    `pair` is a row of `ShapePairs.compiled_pairs`, `depth` [m] the penetration, `normal` the
+    direction out of the box, `velocity` that of the sphere at the contact, relative to the box
+    [m/s].
     """
     out = dot(velocity, normal)
-    f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)
+    f_n = max(pair[22] * depth * (1.0 - pair[23] * out), 0.0)
     speed = 0.0
     for i in range(3):
         force[i] = velocity[i] - out * normal[i]

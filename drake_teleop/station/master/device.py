@@ -39,7 +39,7 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
             remedy="choose 1000 Hz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
-    slope = device.damping_matrix(q, creeping=True)
+    slope = device.damping_matrix(q, include_coulomb_slope=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
     if rate * period > _MAX_STABLE_RATE_TIMES_PERIOD:
         raise DrakeTeleopError(

@@ -157,12 +157,12 @@ class HapticDevice(HapticDeviceBase):
             task_space.mass_matrix_into(q, J, device, M)
         return M
 
-    def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
+    def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
         """Return the damping matrix D (6, 6): the joint forces are -D dq/dt.
 
-        With `creeping`, D includes the slope of the Coulomb friction at standstill.
+        With `include_coulomb_slope`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
-            slope = creeping * self.parameters.dry_friction / phantom.FRICTION_TANH_RAD_S
-            return np.diag(slope + self.parameters.damping)
-        return task_space.damping_matrix(q, self.parameters, creeping)
+            slope = self.parameters.dry_friction / phantom.FRICTION_TANH_RAD_S
+            return np.diag(include_coulomb_slope * slope + self.parameters.damping)
+        return task_space.damping_matrix(q, self.parameters, include_coulomb_slope)

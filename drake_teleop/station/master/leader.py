@@ -44,16 +44,16 @@ _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
-def leader_acceleration_into(arm, joint_table, q, v, applied, motor, vdot):
+def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
-    `applied` (6,) is the hand's wrench minus the hand's weight, [f; tau] on E, in B.
+    `hand_wrench_minus_weight` (6,) is [f; tau] on E, in B; the weight is that of the hand.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
     forward_kinematics(arm, q, R_BE, p_BE)
-    copy_into(wrench, 0, applied, 0, 6)  # becomes the wrench about the origin of B
-    moment = cross(vector_at(p_BE, 0), vector_at(applied, 0))
+    copy_into(wrench, 0, hand_wrench_minus_weight, 0, 6)  # becomes the wrench about the origin of B
+    moment = cross(vector_at(p_BE, 0), vector_at(hand_wrench_minus_weight, 0))
     for i in range(3):
         wrench[3 + i] += moment[i]
     for i in range(n):
@@ -266,24 +266,23 @@ class LeaderDevice(HapticDeviceBase):
     def mass_matrix(self, q: Array) -> Array:
         return mass_matrix(self.arm, np.asarray(q))
 
-    def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
+    def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
         own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, DAMPING_COLUMN]
-        return np.diag(
-            own + creeping * self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
-        )
+        slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+        return np.diag(own + include_coulomb_slope * slope)
 
 
 def make_leader_joint_table(
-    arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
+    arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, weight_share: float
 ) -> Array:
     """Return `LeaderDevice.joint_table` (8, n); the end stops scale with the inertia at home.
 
     `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
-    the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
+    the model's [N m s/rad], each (n,); `weight_share` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
-    return np.array([*rows, np.full(len(home), carried)])
+    return np.array([*rows, np.full(len(home), weight_share)])
 
 
 class LeaderArm(DeviceBlock):

@@ -67,12 +67,10 @@ class Leader:
                 what = f"a leader arm requires a {name.replace('_', ' ')}"
                 raise DrakeTeleopError(what, where=f"{where}.{name}", remedy="set this field")
 
-    def add_to_plant(
-        self, plant: MultibodyPlant, X_Table: RigidTransform | None = None
-    ) -> ParsedArm:
-        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world."""
+    def add_to_plant(self, plant: MultibodyPlant, X_WB: RigidTransform | None = None) -> ParsedArm:
+        """Add the leader arm to a plant; X_WB is the pose of its base frame B in the world."""
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
-        X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
+        X_WBase = X_BBase if X_WB is None else X_WB @ X_BBase
         packages = tuple(map(Path, self.package_paths))
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 

@@ -109,11 +109,11 @@ def pose_into(q, pose):
         pose[4 + i] = q[i]
 
 
-def damping_matrix(q: Array, device: DeviceParameters, creeping: bool) -> Array:
+def damping_matrix(q: Array, device: DeviceParameters, include_coulomb_slope: bool) -> Array:
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_TANH_M_S, FRICTION_TANH_RAD_S])
-    drag = device.damping[[0, 3]] + creeping * device.dry_friction[[0, 3]] / of_tanh
+    drag = device.damping[[0, 3]] + include_coulomb_slope * device.dry_friction[[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
 

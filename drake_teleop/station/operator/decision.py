@@ -219,8 +219,9 @@ def _finish_task(state, memory, time, outcome):
 
 
 @njit(cache=True)
-def _enter_phase(state, memory, phase, ready):
-    state[PHASE_INDEX], memory[_NEXT_MOVE_TIME], memory[_CRITERION_MET_SINCE] = phase, ready, -1.0
+def _enter_phase(state, memory, phase, next_move_time):
+    state[PHASE_INDEX], memory[_NEXT_MOVE_TIME] = phase, next_move_time
+    memory[_CRITERION_MET_SINCE] = -1.0
 
 
 @njit(cache=True)

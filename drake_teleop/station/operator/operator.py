@@ -217,20 +217,21 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 
 @njit(cache=True)
-def _intended_plus_planned_motion_into(packed, start, moving, memory, time, pose, twist):
+def _intended_plus_planned_motion_into(packed, start, start_twist, memory, time, pose, twist):
     intended_motion_into(packed, start, time, pose, twist)
     for k in range(6):
-        twist[k] += moving[k]
+        twist[k] += start_twist[k]
     if memory.shape[0] > 0:
         add_planned_motion_into(memory, time, pose, twist)
 
 
 @njit(cache=True, omits_reference_counting=True)
 def _hand_wrench_at_time(
-    packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
+    packed, start, start_twist, memory, time, impedance, intent_pose, intent_twist, pose, twist,
+    wrench,
 ):  # fmt: skip
     _intended_plus_planned_motion_into(
-        packed, start, moving, memory, time, intent_pose, intent_twist
+        packed, start, start_twist, memory, time, intent_pose, intent_twist
     )
     hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 

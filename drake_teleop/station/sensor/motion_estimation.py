@@ -400,12 +400,12 @@ def _rotation_between_into(before, R, angle):
 
 
 @njit(cache=True)
-def _update_fusion_filters(gains, period, moved, acceleration, kept):
+def _update_fusion_filters(gains, period, displacement_to_correction, acceleration, filter_memory):
     for i in range(3):
-        mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
-        rate = kept[3 + i] + period * mean
-        innovation = kept[i] + moved[i] - period * rate
-        kept[i] = innovation - gains[0] * innovation
-        kept[3 + i] = rate + gains[1] * innovation
-        kept[9 + i] = kept[6 + i]
-        moved[i] = gains[2] * innovation
+        mean = (acceleration[i] + 10.0 * filter_memory[6 + i] + filter_memory[9 + i]) / 12.0
+        rate = filter_memory[3 + i] + period * mean
+        innovation = filter_memory[i] + displacement_to_correction[i] - period * rate
+        filter_memory[i] = innovation - gains[0] * innovation
+        filter_memory[3 + i] = rate + gains[1] * innovation
+        filter_memory[9 + i] = filter_memory[6 + i]
+        displacement_to_correction[i] = gains[2] * innovation

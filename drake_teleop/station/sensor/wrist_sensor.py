@@ -159,20 +159,20 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def append_step_to_queue(tail, time, state, around):
+def append_step_to_queue(tail, time, state, surroundings):
     """Append time and state of a step's end to the queue `tail`, see `take_due_samples`."""
-    width = state.shape[0] + 1 + around.shape[0]
+    width = state.shape[0] + 1 + surroundings.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
-    assemble_plant_state(state, around, entry[1:])
+    assemble_plant_state(state, surroundings, entry[1:])
     tail[1] += 1.0
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _try_queue_step(memory, tail, longest, time, state, around):
+def _try_queue_step(memory, tail, longest, time, state, surroundings):
     if memory[tail + 1] >= longest:
         return False
-    append_step_to_queue(memory[tail:], time, state, around)
+    append_step_to_queue(memory[tail:], time, state, surroundings)
     return True
 
 
@@ -185,7 +185,7 @@ def _extrapolate_torque_into(held, after, torque):
 
 @njit(cache=True, omits_reference_counting=True)
 def take_due_samples(
-    physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
+    physics, sensor, period, time, state, surroundings, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
     """Take the samples that are due in the integration steps since the last call.
@@ -197,7 +197,7 @@ def take_due_samples(
             and of `tail`, ideal).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
-        around: present [deflection and rate of the sheet, plant's state if other bodies move].
+        surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
@@ -208,7 +208,7 @@ def take_due_samples(
     """
     n = state.shape[0] // 2
     size, half, tau, joints = regressor.FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
-    extra = around.shape[0] - 2
+    extra = surroundings.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
     after = result[size + 1 :]
@@ -219,11 +219,11 @@ def take_due_samples(
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
-    assemble_plant_state(state, around, now)
+    assemble_plant_state(state, surroundings, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _extrapolate_torque_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
-        none, sheet, plant = physics[2][:0], around[:2], around[2:]
+        none, sheet, plant = physics[2][:0], surroundings[:2], surroundings[2:]
         environment_wrench_about_Wo_into(
             physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
         )
@@ -263,7 +263,7 @@ def take_due_samples(
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
-    append_step_to_queue(tail, time, state, around)
+    append_step_to_queue(tail, time, state, surroundings)
 
 
 class WristSensor(LeafSystem):
@@ -286,8 +286,8 @@ class WristSensor(LeafSystem):
         output_ports:
         - step: [the last sample before now (16 + n) | its time [s] | memory]
 
-    The motors hold a torque, or with `ramps` its rate, for the duration `held` [s]. A force that
-    the sensor does not receive raises a DrakeTeleopError during simulation.
+    The motors hold a torque, or with `ramps` its rate, for `hold_time` [s]. A force that the sensor
+    does not receive raises a DrakeTeleopError during simulation.
     """
 
     __slots__ = ONE_DICT
@@ -298,7 +298,7 @@ class WristSensor(LeafSystem):
         config: WristSensorConfig,
         motion: MotionEstimationConfig,
         period: float,
-        held: float,
+        hold_time: float,
         *,
         ramps: bool = False,
     ) -> None:
@@ -335,9 +335,9 @@ class WristSensor(LeafSystem):
         self.moving_bodies_sentence = ", ".join(moving) + " can move" * bool(moving)
         copy = partial(ContactPlantCopy, slave.config, slave.environment, slave.start)
         self._twin = cache(copy)  # made at its first use
-        self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
+        self._max_twin_wrenches = 2 * self._max_queued_steps + int(hold_time / period) + 4
         self._period = period
-        self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
+        self._event_periods = (hold_time, SAMPLES_PER_NOISE_BLOCK * period)
         self._no_noise, self._zero_wrench = np.zeros(NOISE_BLOCK_SIZE), np.zeros(6)
         self._no_rate = np.zeros(0)
 
@@ -410,14 +410,14 @@ class WristSensor(LeafSystem):
     def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _tool_proximity(self, state: Array, around: Array) -> int:
+    def _tool_proximity(self, state: Array, surroundings: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
         if self.reason_beyond_contact_law:
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
-        q = state[: self._n]
-        return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
+        q, sheet, plant = state[: self._n], surroundings[:2], surroundings[2:]
+        return tool_proximity(arm, pairs, self._watched, joints, q, sheet, plant)
 
     def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None
@@ -533,14 +533,14 @@ def AddCompiledWristSensor(
     config: WristSensorConfig,
     motion: MotionEstimationConfig,
     period: float,
-    held: float,
+    hold_time: float,
     torque: Mapping[str, OutputPort],
 ) -> dict[str, OutputPort]:
     """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
     `torque` contains the ports of the joint control: `joint_torque`, and `torque_rate` if it ramps.
     """
-    sensor = WristSensor(slave, config, motion, period, held, ramps="torque_rate" in torque)
+    sensor = WristSensor(slave, config, motion, period, hold_time, ramps="torque_rate" in torque)
     builder.AddNamedSystem("wrist_sensor", sensor)
     connect_matching_inputs(builder, sensor, slave.ports)
     connect_matching_inputs(builder, sensor, torque)

@@ -138,12 +138,12 @@ def weld_held_joints(
 
 
 def weld_joints_outside_chain(
-    plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
+    plant: MultibodyPlant, joints_before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Weld moving joints that are in neither `before` nor `chain`; return notes for the user."""
+    """Weld moving joints in neither `joints_before` nor `chain`; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
-    added = set(plant.GetJointIndices()) - before - set(chain)
+    added = set(plant.GetJointIndices()) - joints_before - set(chain)
     joints = [plant.get_joint(index) for index in added if is_joint_moving(plant, index)]
     names = sorted(joint.name() for joint in joints)
     for joint in joints:

@@ -2,8 +2,8 @@
 
 Levenberg-Marquardt steps minimize ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]``. Joints that the error
 pushes against a limit are fixed (active set). If the smallest singular value sigma of the Jacobian
-(rotations times L) is below ``s = SINGULAR``, `follow_pose` adds damping ``lambda^2 = s^2 -
-sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
+(rotations times L) is below ``s = MIN_SINGULAR_VALUE_M``, `follow_pose` adds damping
+``lambda^2 = s^2 - sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def _wrist_or_shoulder_status(L, J):
 
 @njit(cache=True)
 def follow_pose(
-    table, L, pose, reference, lower, upper, max_step, posture, pull, singular, steps, q
+    table, L, pose, reference, lower, upper, max_step, posture, pull, min_singular_value, steps, q
 ):
     """Write joint positions q (n,) near a reference that meet a pose; return the `IkStatus`.
 
@@ -190,7 +190,7 @@ def follow_pose(
         max_step: (n,) largest displacement from the reference.
         posture: (n,) joint positions that a redundant arm approaches.
         pull: share of the distance to the posture that is covered by this call.
-        singular: singular value of the Jacobian below which the motion is damped [m].
+        min_singular_value: singular value of the Jacobian below which the motion is damped [m].
         steps: maximum number of Levenberg-Marquardt steps.
     """
     n = q.shape[0]
@@ -220,7 +220,7 @@ def follow_pose(
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
     squared = _jacobian_and_pose_error(table, L, pose, q, x, J, e)
     _smaller_gram_matrix_into(J, B)
-    damping = max(singular * singular - _find_smallest_eigenpair(B, u), 0.0)
+    damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
         copy_into(anchor, 0, q, 0, n)
@@ -285,7 +285,10 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared:
+        if (
+            min_singular_value > 0.0
+            and free > _ZERO_GRADIENT_RATIO_M * _ZERO_GRADIENT_RATIO_M * squared
+        ):
             return _wrist_or_shoulder_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
@@ -295,7 +298,7 @@ def follow_pose(
         # move the arm.
         _find_smallest_eigenpair(H, g)
         size = _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M
-        if singular > 0.0:
+        if min_singular_value > 0.0:
             size = min(_MAX_SINGULARITY_ESCAPE_RAD_OR_M, 10.0 * np.sqrt(squared) / L)
         slope = 0.0
         for i in range(n):

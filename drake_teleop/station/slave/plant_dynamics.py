@@ -101,13 +101,13 @@ def _place_box_at_body(pair, bodies, placed):
 
 
 @njit(cache=True)
-def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
-    """Return a code `PROXIMITY_...`; `pairs` and `watched` are those of `ShapePairs`."""
+def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
+    """Return a code `PROXIMITY_...`; `pairs` and `monitored_pairs` are those of `ShapePairs`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
-    for pair in watched:
+    for pair in monitored_pairs:
         box = _place_box_at_body(pair, bodies, placed)
         if (
             lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
@@ -161,13 +161,13 @@ class ToolContact(LeafSystem):
 
 
 @njit(cache=True)
-def assemble_plant_state(state, around, x):
-    """Write x from the arm's `state` [q; v] and `around` [leaf deflection, rate, plant's q; v]."""
+def assemble_plant_state(state, surroundings, x):
+    """Write x from `state` [q; v] and `surroundings` [leaf deflection, rate, plant's q; v]."""
     n = state.shape[0] // 2
     copy_into(x, 0, state, 0, n)
     copy_into(x, n + 1, state, n, n)
-    x[n], x[2 * n + 1] = around[0], around[1]
-    copy_into(x, 2 * n + 2, around, 2, around.shape[0] - 2)
+    x[n], x[2 * n + 1] = surroundings[0], surroundings[1]
+    copy_into(x, 2 * n + 2, surroundings, 2, surroundings.shape[0] - 2)
 
 
 @njit(cache=True)

@@ -65,7 +65,7 @@ def read_world_with_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     if kind == "site":
         sensors = [each for each in mjcf.elements_in("sensor") if each.tag in ("force", "torque")]
         measured = {each.get("site", "") for each in sensors}
-        arm = _insert_sensor_frame_at_site(arm, sensor, is_measured=sensor in measured)
+        arm = _insert_sensor_frame_at_site(arm, sensor, is_force_sensor_site=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
@@ -161,20 +161,20 @@ def _split_into_one_joint_bodies(body: Body) -> Body:
     return outer
 
 
-def _insert_sensor_frame_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
+def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site: bool) -> Body:
     """Add a massless body at the pose of a site, as sensor frame.
 
     The new body carries the site's body if a `force` or `torque` sensor measures there
-    (`is_measured`). Otherwise the site's body carries it.
+    (`is_force_sensor_site`). Otherwise the site's body carries it.
     """
     if site not in body.sites:
         body.children = [
-            _insert_sensor_frame_at_site(child, site, is_measured=is_measured)
+            _insert_sensor_frame_at_site(child, site, is_force_sensor_site=is_force_sensor_site)
             for child in body.children
         ]
         return body
     X_BS = body.sites.pop(site)
-    if not is_measured:
+    if not is_force_sensor_site:
         body.children.append(Body(site, X_BS, is_auxiliary=True))
         return body
     X_SB = X_BS.inverse()
