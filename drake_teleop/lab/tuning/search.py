@@ -1,8 +1,7 @@
 """Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
 
 Limit of the linear loop; simulation in one axis; the whole station with all grips of the set, at
-its softest and stiffest wall and between them, with several seeds. There gamma grows until a run
-fails, or becomes smaller.
+its softest and stiffest wall and between them, with several seeds.
 """
 
 from __future__ import annotations
@@ -37,8 +36,10 @@ CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 """Candidates; others are dominated by them or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
+STIFFEST_WALL_FACTORS = (1.2, 2.0)
+"""Factors of the stiffest wall, at which the limits of the settings are searched."""
 BEYOND_MARGIN_FACTOR = 1.2
-"""Factor of the margin of gamma at which a failure is searched."""
+"""Factor of the margin of gamma, at which they are searched too."""
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
@@ -58,7 +59,7 @@ class SearchResult:
         searched_settings: tried settings in one axis, with the predicted `threshold_N` and `gamma`.
         given_runs: runs of the user's settings at the stiffest wall.
         inside_runs: runs in the stated set: gamma times margin, then gamma at the stiffest wall.
-        beyond_runs: runs with a gamma that is `BEYOND_MARGIN_FACTOR` larger.
+        beyond_runs: runs with a larger gamma, then at stiffer walls.
     """
 
     settings: TunedSettings
@@ -110,11 +111,9 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        settings = settings_from_values(row)
-        cap = caps[settings.low_pass_hz] / margin
-        gamma, inside = _find_gamma_limit_in_station(settings, cap, trial, execute)
+        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
         if inside:
-            chosen = dataclasses.replace(settings, gamma=gamma)
+            chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -125,17 +124,16 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         )
     _, chosen, inside = found[0]
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
-    study = _study_of_settings(larger, ends, list(stated.walls[::-1]), repeats=2)
-    return SearchResult(chosen, search, given, inside, execute("larger_gamma", study, trial))
+    beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)
+    walls = [factor * stiffest for factor in STIFFEST_WALL_FACTORS]
+    beyond += execute("stiffer_walls", _study_of_settings(chosen, ends, walls, repeats=2), trial)
+    return SearchResult(chosen, search, given, inside, beyond)
 
 
 def _find_gamma_limit_in_station(
-    settings: TunedSettings, cap: float, trial: StationPressTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma up to `cap` that holds, and its runs; 0: none holds.
-
-    The search starts at the gamma of `settings`, which holds in one axis.
-    """
+    """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
 
     def holds(rows: list[Row]) -> bool:
         return all(meets_requirements(row, MAX_TUNED_FORCE_ERROR) for row in rows)
@@ -162,12 +160,9 @@ def _find_gamma_limit_in_station(
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
                 smaller = max(smaller, quiet / _GAMMA_STEP_ABOUT_NOISE_LIMIT)
                 failed = min(failed, quiet * _GAMMA_STEP_ABOUT_NOISE_LIMIT)
-        if min(failed, cap) <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
+        if failed == np.inf or failed <= _MAX_UNSTABLE_OVER_STABLE_GAMMA * stable:
             break
-        if failed == np.inf:
-            gamma = min(2 * stable, cap)
-        else:
-            gamma = float(np.sqrt(stable * failed)) if stable else smaller
+        gamma = float(np.sqrt(stable * failed)) if stable else smaller
     return stable, inside
 
 

@@ -137,7 +137,8 @@ def _make_tuning_summary(
         }
         if failed
         else None,
-        "largest_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
+        "beyond_N_per_m": max(row["wall"] for row in found.beyond_runs),
+        "beyond_gamma_factor": max(row["gamma"] for row in found.beyond_runs) / gamma,
     }
     settings = dataclasses.asdict(found.settings) | {"sigma_weight": 0.0, "force_scale": scale}
     about = {
@@ -178,8 +179,10 @@ def _tuning_result_sentences(
     ]
     fails = figures["fails_at"]
     if fails is None:
-        factor = figures["largest_gamma_factor"]
-        last = f"No failure was found up to gamma {factor:.2f} times as large."
+        last = (
+            f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m, or "
+            f"with gamma {figures['beyond_gamma_factor']:.2f} times as large."
+        )
     else:
         wall, factor = fails["wall_N_per_m"] / 1e3, fails["gamma_factor"]
         last = (
