@@ -110,5 +110,5 @@ def _limit_norm(a: Array, longest: float) -> Array:
     return a if length <= longest else longest / length * a
 
 
-def _limit_slew(last: Array, wanted: Array, max_force: float) -> Array:
-    return last + _limit_norm(wanted - last, max_force)
+def _limit_slew(last: Array, wanted: Array, max_change: float) -> Array:
+    return last + _limit_norm(wanted - last, max_change)

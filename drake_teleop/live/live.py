@@ -282,7 +282,7 @@ class Live:
     def _limited_inputs(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
-        return self._limiter.limit_inputs(wanted, free=free)
+        return self._limiter.limit_inputs(wanted, may_jump=free)
 
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()

@@ -62,10 +62,10 @@ class MotionLimiter:
             for name in names:
                 self._axes[name] = _AxisLimiter(units * speed, change, INPUT_RANGES[name])
 
-    def limit_inputs(self, inputs: Inputs, *, free: bool) -> Inputs:
-        """Return the limited inputs of the next period; `free` permits jumps of the target."""
+    def limit_inputs(self, inputs: Inputs, *, may_jump: bool) -> Inputs:
+        """Return the limited inputs of the next period; `may_jump` permits jumps of the target."""
         followed = {
-            name: axis.limit_target(getattr(inputs, name), free)
+            name: axis.limit_target(getattr(inputs, name), may_jump)
             for name, axis in self._axes.items()
         }
         return inputs.with_changes(followed)
@@ -76,9 +76,9 @@ class _AxisLimiter:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._moved = 0.0
 
-    def limit_target(self, target: float, free: bool) -> float:
+    def limit_target(self, target: float, may_jump: bool) -> float:
         last, self._target = self._target, target
-        if free:
+        if may_jump:
             self._at, self._moved = target, 0.0
             return target
         behind = last - self._at

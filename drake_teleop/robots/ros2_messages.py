@@ -37,11 +37,11 @@ def domain_of_address(address: Address) -> int:
     return int(text)
 
 
-def checked_topic_name(address: Address, text: str) -> str:
-    topic = text.strip("/")
+def checked_topic_name(address: Address, name: str) -> str:
+    topic = name.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
-            f"{text!r} is not the name of a ROS topic",
+            f"{name!r} is not the name of a ROS topic",
             where=address.text,
             remedy="give one such as /ft_sensor/wrench",
         )

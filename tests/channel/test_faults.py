@@ -56,7 +56,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     """Simulate both ends with a prescribed motion of the hand and a slave behind a servo."""
     p = method_parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
     line = NetworkConfig(delay=DELAY)
-    lines = [network.network_parameters(line, 0, way, T, least=1) for way in range(2)]
+    lines = [network.network_parameters(line, 0, way, T, min_steps=1) for way in range(2)]
     states = [network.initial_network_state(each, np.zeros(PACKET_SIZE)) for each in lines]
     frame = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1])
     hand = hand_position()

@@ -38,7 +38,7 @@ def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
         begun = min(t / 0.2, 1.0)
         ramp = begun**2 * (3.0 - 2.0 * begun)
         target = inputs_of(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
-        assert limiter.limit_inputs(target, free=False) == target
+        assert limiter.limit_inputs(target, may_jump=False) == target
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
@@ -49,7 +49,7 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
     for k in range(4000):
         if k % 40 == 0 and k < 3000:
             target = inputs_of(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # partly outside
-        path.append(pose_of(limiter.limit_inputs(target, free=False)))
+        path.append(pose_of(limiter.limit_inputs(target, may_jump=False)))
     tool = scale * np.array(path)
     speed = np.diff(tool, axis=0) / slice_s
     rounding = 2.0 * scale * 1e-5 / slice_s
@@ -64,7 +64,9 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
 def test_limited_motion_stops_without_overshoot():
     limiter, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
-        path.append(limiter.limit_inputs(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
+        path.append(
+            limiter.limit_inputs(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), may_jump=False)
+        )
     assert max(each.x for each in path) <= 5000 * 1.01 and path[-1].x == 5000
     assert max(each.rz for each in path) <= 5000 * 1.01 and path[-1].rz == 5000
     assert path[60].x > 2500  # as soon as 20 m/s^2 allow
@@ -72,8 +74,8 @@ def test_limited_motion_stops_without_overshoot():
 
 def test_free_target_may_jump():
     limiter, target = MotionLimiter(2e-3, (1.0, 1.0), device=True), inputs_of(np.full(6, 0.1))
-    assert limiter.limit_inputs(target, free=True) == target
-    assert limiter.limit_inputs(target, free=False) == target
+    assert limiter.limit_inputs(target, may_jump=True) == target
+    assert limiter.limit_inputs(target, may_jump=False) == target
 
 
 @pytest.mark.slow

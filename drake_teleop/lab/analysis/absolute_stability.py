@@ -79,15 +79,14 @@ def scattering_norm(S: Complex) -> Array:
 
 
 def structured_singular_value(
-    S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
+    S: Complex, max_hand_reflection: ArrayLike = 1.0, max_environment_reflection: ArrayLike = 1.0
 ) -> Array:
     """Return the structured singular value mu of the scattering matrix S (T56).
 
-    `hand`, `environment`: largest reflection factors. With 1 (any passive load), mu <= 1 means
-    absolutely stable.
+    The largest reflection factors are 1 for any passive load; then mu <= 1 means absolutely stable.
     """
     s11, s12, s21, s22 = matrix_entries(S)
-    r1, r2 = np.asarray(hand), np.asarray(environment)
+    r1, r2 = np.asarray(max_hand_reflection), np.asarray(max_environment_reflection)
     product = s12 * s21 * r1 * r2
     even = np.sqrt(np.abs(product))
     turned = product / np.where(even > 0, even, 1.0)

@@ -70,14 +70,14 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
     return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))
 
 
-def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return the response (N, ...) at `frequency` [rad/s], `delay` one way [s]; limit: 1."""
-    dimensions = max(loop.period_s.ndim, np.ndim(delay))
-    w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
+def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
+    """Return the response (N, ...) at `omega` [rad/s]; stability limit: 1."""
+    dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
+    w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
     # Factor by factor, to keep precision for poles close to z = 1.
     L = 1 - np.prod((z - loop.closed_multipliers) / (z - loop.open_multipliers), axis=-1)
-    return L * np.exp(-2j * w * np.asarray(delay))
+    return L * np.exp(-2j * w * np.asarray(one_way_delay_s))
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
@@ -105,9 +105,9 @@ def _interpolate_in_steps(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
-def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of unstable eigenvalues of the closed loop; `delay`: one way [s]."""
-    D = (2 * np.asarray(delay) / loop.period_s)[..., None]
+def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDArray[np.int64]:
+    """Return the number of unstable eigenvalues of the closed loop."""
+    D = (2 * np.asarray(one_way_delay_s) / loop.period_s)[..., None]
     angles = loop.gain_crossing_angles
     turns = (loop.gain_crossing_phases - D * angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.

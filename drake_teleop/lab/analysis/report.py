@@ -254,8 +254,8 @@ def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
     return figure
 
 
-def _draw_stability_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
-    one = shown[grip]
+def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], grip: str) -> Any:
+    one = map_of_grip[grip]
     (x_label, x_factor), (y_label, y_factor) = _AXIS_LABELS[one.x_name], _AXIS_LABELS[one.y_name]
     x, y = x_factor * one.x, y_factor * one.y
     distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
@@ -263,7 +263,7 @@ def _draw_stability_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str
     mesh = axes.pcolormesh(
         x, y, distortion, norm=LogNorm(0.01, 1.0), cmap="YlGnBu", shading="nearest", rasterized=True
     )
-    for name, other in shown.items():
+    for name, other in map_of_grip.items():
         edge = other.boundary * (x_factor, y_factor)
         axes.plot(*edge.T, color=_GRIP_COLOURS[name], linestyle="", marker=".", ms=2.2)
     for scale, name in ((axes.set_xscale, one.x_name), (axes.set_yscale, one.y_name)):

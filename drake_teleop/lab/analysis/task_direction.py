@@ -139,9 +139,9 @@ def _device_mass_and_damping(
     return float(1 / mobility - hand.mass), float(damping)
 
 
-def _find_displaced_posture(slave: SlavePlant, moved: Array) -> Array:
+def _find_displaced_posture(slave: SlavePlant, displacement_W: Array) -> Array:
     arm, pose = slave.arm, slave.X_WS_start.copy()
-    pose[4:] += moved
+    pose[4:] += displacement_W
     if has_closed_form(arm):
         R_WS = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))).matrix()
         q, status = nearest_branch(R_WS, pose[4:], slave.start, arm.lower, arm.upper)
@@ -149,7 +149,8 @@ def _find_displaced_posture(slave: SlavePlant, moved: Array) -> Array:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
         raise DrakeTeleopError(
-            f"the arm cannot reach this displacement of {moved} m ({IkStatus(status).name})",
+            f"the arm cannot reach this displacement of {displacement_W} m "
+            f"({IkStatus(status).name})",
             where="displacement",
             remedy="choose a smaller displacement or another start posture",
         )

@@ -184,7 +184,7 @@ def run_one_dof(
         (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
     )
     lines = [
-        network.network_parameters(line, seed, direction, PERIOD, least=1, delays=travels)
+        network.network_parameters(line, seed, direction, PERIOD, min_steps=1, delays=travels)
         for line, direction, travels in (
             (forward_line, network.FORWARD, forward_delays),
             (forward if backward is None else backward, network.BACKWARD, backward_delays),

@@ -196,9 +196,9 @@ class LevelModel:
     def _std_over_residual(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.pseudo_inverse, axis=1)
 
-    def _half_width_over_points(self, table: Array, together: int) -> float:
+    def _half_width_over_points(self, table: Array, num_intervals: int) -> float:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
-        return _student_quantile(together, self._degrees_of_freedom) * float(np.sqrt(variance))
+        return _student_quantile(num_intervals, self._degrees_of_freedom) * float(np.sqrt(variance))
 
     def _half_width_over_seeds(self, table: Array, terms: Array) -> float:
         seeds = table.shape[1]
@@ -294,8 +294,8 @@ def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
     return codes
 
 
-def _student_quantile(together: int, freedom: int) -> float:
-    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / together))
+def _student_quantile(num_intervals: int, freedom: int) -> float:
+    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE_LEVEL) / 2 / num_intervals))
 
 
 def _format_value(value: FactorValue) -> str:

@@ -50,16 +50,16 @@ class Store:
             self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, temporary_base=self.folder
         )
 
-    def count_chunk_start(self, run: int) -> None:
-        """Count one more start of the chunk whose first run is `run`."""
-        path = self._start_counts_folder / str(run)
+    def count_chunk_start(self, first_run: int) -> None:
+        """Count one more start of the chunk that starts with `first_run`."""
+        path = self._start_counts_folder / str(first_run)
         with wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
 
-    def clear_chunk_starts(self, run: int) -> None:
-        (self._start_counts_folder / str(run)).unlink(missing_ok=True)
+    def clear_chunk_starts(self, first_run: int) -> None:
+        (self._start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
     def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
         """Return the first runs of unfinished chunks with at least `times` starts."""

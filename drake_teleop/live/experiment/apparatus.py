@@ -47,16 +47,16 @@ class Apparatus:
     load: IdentifiedLoad | None
     load_mass_at_hand: float
 
-    def stimulus_scales_percent(self, level: float, pressed: float) -> dict[str, int]:
+    def stimulus_scales_percent(self, level: float, contact_force: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
-        `level` is the rendered force [N] or mass [kg], `pressed` the expected contact force [N].
+        `level` is the rendered force [N] or mass [kg], `contact_force` the expected one [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
         if isinstance(self.task, ContactDetection):
-            gamma = max(1.0, gamma * level / pressed) if level else 0.0
+            gamma = max(1.0, gamma * level / contact_force) if level else 0.0
         elif isinstance(self.task, ApparentMass) and level:
             share += max(1.0, 100.0 * level / self.load_mass_at_hand)
         if condition.eta is None:
@@ -65,9 +65,9 @@ class Apparatus:
         return {name: min(round(value), _MAX_SCALE_PERCENT) for name, value in values.items()}
 
     def interval_result(
-        self, shown: float, inputs: dict[str, int], rows: IntervalLog
+        self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval; `shown`: intended level (0: no stimulus)."""
+        """Return the result of an interval; `target`: intended level (0: no stimulus)."""
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -75,10 +75,10 @@ class Apparatus:
             )
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
-            return IntervalResult(level if shown else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
+            return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
         before = self.condition.sigma if self.condition.eta is None else self.condition.eta
         level = self.load_mass_at_hand * (inputs["sigma_object"] / 100.0 - before)
-        return IntervalResult(level if shown else 0.0, force)
+        return IntervalResult(level if target else 0.0, force)
 
 
 def make_apparatus(

@@ -131,14 +131,16 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     ), rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _run_peg_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:
+def _run_peg_insertion(
+    apparatus: Apparatus, task_scenario: Scenario, procedure: Procedure
+) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
-    assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
+    assert isinstance(task, PegInSlot) and isinstance(task_scenario.operator.task, Insert)
     scenario = replace(
         with_interval_seed(apparatus.scenario, procedure),
-        operator__task=own.operator.task,
+        operator__task=task_scenario.operator.task,
         simulation__duration=task.timeout,
-        simulation__settle=own.simulation.settle,
+        simulation__settle=task_scenario.simulation.settle,
         simulation__end_with_task=True,
         force_scaling__sigma=condition.sigma,
         force_scaling__gamma=condition.gamma,

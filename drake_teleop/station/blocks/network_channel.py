@@ -58,7 +58,7 @@ class NetworkChannel(SteppedBlock):
                 where="NetworkChannel.silence",
                 remedy="set silence: hold, or use a passivity method",
             )
-        self._parameters = network.network_parameters(config, seed, direction, period, least=1)
+        self._parameters = network.network_parameters(config, seed, direction, period, min_steps=1)
         parts = network.initial_network_state(self._parameters, np.zeros(size))
         state = [*parts, np.zeros(1), np.zeros(size + 1)]
         self._packet = self.DeclareVectorInputPort("packet", size)

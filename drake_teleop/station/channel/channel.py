@@ -333,7 +333,7 @@ class TeleopChannel(SteppedBlock):
         # A motion scale of zero transfers no energy; any unit is valid.
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
-            network.network_parameters(line, seed, direction, period, least=_MIN_DELAY_STEPS)
+            network.network_parameters(line, seed, direction, period, min_steps=_MIN_DELAY_STEPS)
             for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
@@ -367,15 +367,15 @@ class TeleopChannel(SteppedBlock):
         flag = slice(_RECEIVED_CONTACT_FLAG, _RECEIVED_CONTACT_FLAG + 1)
         self._declare_output("contact_at_hand", 5, flag)
 
-    def Restart(self, context: Context, command: Array, slave: Array, fills: float) -> None:
+    def Restart(self, context: Context, command: Array, slave: Array, fill_time_s: float) -> None:
         """Restart the channel in a running station, without packets, at a constant slave command.
 
-        `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
-        time in which the slave of method `wave` keeps its command.
+        `command` and `slave` (7,) are commanded and actual X_WS of the slave. During
+        `fill_time_s` the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
         ends[_LAST_FINITE_SLAVE_POSE_AND_FLAG][:7] = slave
-        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fills
+        ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME_LEFT] = fill_time_s
         context.SetDiscreteState(self._states[2], ends)
         context.SetDiscreteState(self._states[3], command)
 

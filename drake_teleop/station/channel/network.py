@@ -117,7 +117,7 @@ def network_parameters(
     seed: int,
     direction: int,
     period: float,
-    least: int = 0,
+    min_steps: int = 0,
     delays: NDArray[np.int64] | None = None,
 ) -> Array:
     """Return the parameters of one direction for `send_packet` and `receive_packet`.
@@ -125,7 +125,7 @@ def network_parameters(
     Args:
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
-        least: smallest delay of a packet [steps].
+        min_steps: smallest delay of a packet [steps].
         delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
             repeated after its end.
     """
@@ -138,7 +138,7 @@ def network_parameters(
     )
     if trace.size:
         longest = max(int(trace.max()), 0)
-    longest = max(longest, least)
+    longest = max(longest, min_steps)
     bad = config.loss / config.burst_loss
     time_constant = config.burst * (1 - bad)  # time constant of the chain
     p = np.empty(_DELAY_TRACE_START + trace.size)
@@ -153,7 +153,7 @@ def network_parameters(
     p[_PACKETS_PER_STEP] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT_STEPS], p[_IS_REDUNDANT] = playout, config.redundant
     p[_NUM_TRANSIT_SLOTS] = max(longest, playout) + 1
-    p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), least
+    p[_SILENCE_POLICY], p[_MIN_DELAY_STEPS] = _SILENCE_POLICIES.index(config.silence), min_steps
     p[_DELAY_TRACE_START:] = trace
     return p
 

@@ -35,14 +35,14 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 
 
 @njit(cache=True)
-def force_without_slip_steps(displayed, component, explained, share, max_change):
+def force_without_slip_steps(displayed, component, explained_change, share, max_change):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
     `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
-    `explained` by depth and speed is rendered at once. The remaining difference, at most
+    `explained_change` by depth and speed is rendered at once. The remaining difference, at most
     `max_change`, is reduced by `share`.
     """
-    displayed += explained
+    displayed += explained_change
     displayed += min(share, 1.0) * (component - displayed)
     return min(max(displayed, component - max_change, 0.0), component + max_change)
 

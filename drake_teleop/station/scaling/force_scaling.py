@@ -230,14 +230,14 @@ def _scaled_contact_and_fault_into(
 
 @njit(cache=True)
 def _rendered_wrench_into(
-    sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out
+    sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact_share, out
 ):
     if find_sample_fault(sample, estimate, time, valid_range) != _NO_FAULT:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
     blend_scales_at(change, time, scales)
-    scales[2] *= contact
+    scales[2] *= contact_share
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
     forward_kinematics(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
