@@ -23,7 +23,7 @@ from drake_teleop.logs.causes.state import (
 _MIN_LIKELIHOOD_GAIN_OF_STEP = 60.0
 _STEP_TIME_MOVES_INSTANTS, _MAX_STEP_TIME_MOVES = (1.0, 0.25), 2  # instants
 _MIN_TIME_BETWEEN_STEPS_S, _MIN_LIKELIHOOD_GAIN_OF_RAMP = 0.4, 80.0
-MIN_OMITTED_TIME_AROUND_RAMP_S = 0.5
+MIN_OMITTED_RAMP_SPAN_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
 _NUM_TRIED_STEP_TIMES = 2
 _MIN_STEP_OVER_DEVIATION = 5.0
@@ -82,23 +82,20 @@ class _StepScan:
         self._rows = rows = state.data.rows_per_search_block
         starts = np.arange(0, len(state.data.t), rows)
         gram, right = map(
-            np.stack,
-            zip(
-                *(self._normal_equations_of_rows(n, n + rows) for n in starts.tolist()), strict=True
-            ),
+            np.stack, zip(*(self._equations_of_rows(n, n + rows) for n in starts), strict=True)
         )
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
 
-    def _normal_equations_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
+    def _equations_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
         A, e = self._columns[:, start:stop], self._residual[:, start:stop]
         flat = A.reshape(-1, A.shape[2])
         return flat.T @ flat, flat.T @ e.ravel()
 
     def likelihood_gain_of_step_at(self, n: int) -> float:
         j = -(-n // self._rows)
-        gram, right = self._normal_equations_of_rows(n, j * self._rows)
+        gram, right = self._equations_of_rows(n, j * self._rows)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -116,10 +113,8 @@ def fit_steps_at_middle_of_ramps(
     widths: Sequence[float] | None = None,
 ) -> FittedModel:
     """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
-    widths = [
-        max(MIN_OMITTED_TIME_AROUND_RAMP_S, w + MIN_OMITTED_TIME_AROUND_RAMP_S)
-        for w in (widths or [0.0] * len(times))
-    ]
+    least = MIN_OMITTED_RAMP_SPAN_S
+    widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
@@ -249,7 +244,7 @@ def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
         contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _keep_long_runs_and_fill_single_gaps(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
+        calm = _long_runs_without_gaps(left & ~contact_blocks, _MIN_CALM_RUN_BLOCKS)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
     if not len(inner) or left.sum() > _MAX_UNFITTED_BLOCK_SHARE * blocks.usable.sum():
@@ -269,9 +264,7 @@ def replace_contacts_by_steps(larger: FittedModel) -> FittedModel | None:
     return found if found.residual_ratio < limit else None
 
 
-def _keep_long_runs_and_fill_single_gaps(
-    flags: NDArray[np.bool_], shortest: int
-) -> NDArray[np.bool_]:
+def _long_runs_without_gaps(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
@@ -304,13 +297,13 @@ class _NormalEquationsOfBlocks:
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return True for blocks `among` with a residual far above the calmest; None for few."""
-        found = self._residual_levels_by_fit_to_calm_blocks(np.flatnonzero(among))
+        found = self._residual_levels_by_calm_fit(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_CALM_RMS_MARGIN * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CONTACT_RMS_OVER_CALM * calm)))
-        by_motion = _block_residuals_by_motion_errors(
+        by_motion = _residuals_by_motion_errors(
             self._state, self._state.x + move, excess, among, quantile
         )
         usual = np.hypot(calm, by_motion)
@@ -318,7 +311,7 @@ class _NormalEquationsOfBlocks:
             (level > _CONTACT_RMS_OVER_NOISE) & (level > _CONTACT_RMS_OVER_CALM * usual) & among
         )
 
-    def _residual_levels_by_fit_to_calm_blocks(
+    def _residual_levels_by_calm_fit(
         self, blocks: NDArray[np.intp]
     ) -> tuple[Array, float, Array] | None:
         if len(blocks) < 2 * _MIN_TRIMMED_FIT_BLOCKS:
@@ -370,7 +363,7 @@ class _NormalEquationsOfBlocks:
         return level, move, kept
 
 
-def _block_residuals_by_motion_errors(
+def _residuals_by_motion_errors(
     state: FittedModel, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
 ) -> Array:
     data, rows = state.data, state.data.rows_per_search_block
