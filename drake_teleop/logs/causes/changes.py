@@ -80,7 +80,7 @@ class _StepScan:
         self._residual = (state.rows.y @ (state.residual / power[:, None]).T).T
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
         self._rows = rows = state.data.rows_per_search_block
-        starts = np.arange(0, len(state.data.t), rows)
+        starts = range(0, len(state.data.t), rows)
         gram, right = map(
             np.stack, zip(*(self._equations_of_rows(n, n + rows) for n in starts), strict=True)
         )
