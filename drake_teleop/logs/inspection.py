@@ -113,10 +113,10 @@ def _are_column_names_numbers(names: Sequence[str]) -> bool:
 
 def _free_draft_path(out: Path) -> Path:
     names = ("draft.yaml", *(f"draft-{k}.yaml" for k in range(2, 1000)))
-    return next(path for path in map(out.joinpath, names) if _is_no_users_text(path))
+    return next(path for path in map(out.joinpath, names) if _may_be_replaced(path))
 
 
-def _is_no_users_text(path: Path) -> bool:
+def _may_be_replaced(path: Path) -> bool:
     if not path.exists():
         return True
     text = path.read_text(encoding="utf-8", errors="replace")
