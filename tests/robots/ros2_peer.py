@@ -149,17 +149,22 @@ def run_calls(domain):
     """Call services and set parameters of /drake_teleop as requested by lines on stdin."""
     node = node_in(domain)
     parameters = AsyncParameterClient(node, "/drake_teleop")
+    clients = {
+        name: node.create_client(Trigger, f"/drake_teleop/{name}")
+        for name in ("tare", "load", "calibrate")
+    }
+    parameters.wait_for_services(timeout_sec=60.0)
+    for client in clients.values():
+        client.wait_for_service(timeout_sec=60.0)
+    time.sleep(1.0)  # until the node has found the clients; earlier requests can be lost
     for line in sys.stdin:
         name, *words = line.split()
         if name == "set":
-            parameters.wait_for_services(timeout_sec=60.0)
             value = words[1] if words[0] in ("load", "until") else float(words[1])
             value = " ".join(words[1:]) if words[0] == "until" else value
             future = parameters.set_parameters([Parameter(words[0], value=value)])
         else:
-            client = node.create_client(Trigger, f"/drake_teleop/{name}")
-            client.wait_for_service(timeout_sec=60.0)
-            future = client.call_async(Trigger.Request())
+            future = clients[name].call_async(Trigger.Request())
         rclpy.spin_until_future_complete(node, future, timeout_sec=200.0)
         result = future.result()
         if name == "set":
