@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
@@ -13,11 +12,11 @@ from drake_teleop.common.vectors import add_vector_into, cross, minus, plus, sca
 from drake_teleop.load.regressor import wrench_of_load
 
 
-@register_jitable
-def scaled_wrench_as_tuples(
-    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
+@njit(cache=True)
+def scaled_wrench_into(
+    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    """Return force and torque of `scaled_wrench` as tuples, for scalars of any type."""
+    """Write the wrench of `scaled_wrench` to out (6,)."""
     a, b = sigma_gr - gamma, sigma_obj - gamma
     phi = (
         a * phi_gripper[0] + b * phi_object[0],
@@ -32,39 +31,20 @@ def scaled_wrench_as_tuples(
         a * phi_gripper[9] + b * phi_object[9],
     )
     force, torque = wrench_of_load(s, omega, alpha, phi)
-    force = plus(force, scale_vector(gamma, minus(vector_at(wrench, 0), vector_at(offsets, 0))))
-    return force, plus(
-        torque, scale_vector(gamma, minus(vector_at(wrench, 3), vector_at(offsets, 3)))
-    )
-
-
-@register_jitable
-def excess_weight_as_tuples(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
-    """Return force and torque of the sum of both weights, each times its excess."""
-    a, b = excess_gripper, excess_object
-    up = scale_vector(-1.0, vector_at(gravity, 0))
-    h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
-    return scale_vector(a * phi_gripper[0] + b * phi_object[0], up), cross(h, up)
-
-
-@njit(cache=True)
-def scaled_wrench_into(
-    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
-):
-    force, torque = scaled_wrench_as_tuples(
-        wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
-    )
-    out[0], out[1], out[2] = force
-    out[3], out[4], out[5] = torque
+    contact_force = minus(vector_at(wrench, 0), vector_at(offsets, 0))
+    contact_torque = minus(vector_at(wrench, 3), vector_at(offsets, 3))
+    out[0], out[1], out[2] = plus(force, scale_vector(gamma, contact_force))
+    out[3], out[4], out[5] = plus(torque, scale_vector(gamma, contact_torque))
 
 
 @njit(cache=True)
 def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    force, torque = excess_weight_as_tuples(
-        gravity, phi_gripper, phi_object, excess_gripper, excess_object
-    )
-    add_vector_into(out, 0, force)
-    add_vector_into(out, 3, torque)
+    """Add both weights, times weight scale minus inertia scale, to a wrench (6,)."""
+    a, b = excess_gripper, excess_object
+    up = scale_vector(-1.0, vector_at(gravity, 0))
+    h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
+    add_vector_into(out, 0, scale_vector(a * phi_gripper[0] + b * phi_object[0], up))
+    add_vector_into(out, 3, cross(h, up))
 
 
 @njit(cache=True)
@@ -173,12 +153,12 @@ def weight_scales_and_inertia_scales(
 
 def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
     return DrakeTeleopError(
-        "is unknown, and sigma_weight differs from sigma_inertia", where=where, remedy=remedy
+        "is unknown, but the scales of weight and inertia differ", where=where, remedy=remedy
     )
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper, sigma_object, gamma for the share eta of the object, Eq. (14)."""
+    """Return sigma_gripper, sigma_object, gamma that keep the share eta of the object, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
         what = f"{eta:g} is outside 0 to 1"
         raise DrakeTeleopError(what, where="eta", remedy="give the share of the object that stays")

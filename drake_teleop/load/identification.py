@@ -159,11 +159,12 @@ class Identification:
                 raise DrakeTeleopError("is missing", where=f"{path}:{name}")
 
         def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
+            where = f"{path}:{name}"
             if not _contains_only_numbers(document[name]):
-                raise _file_error("contains values that are not numbers", f"{path}:{name}")
-            array = finite_array(f"{path}:{name}", document[name], *shape)
+                raise _file_error("contains values that are not numbers", where)
+            array = finite_array(where, document[name], *shape)
             if np.abs(array).max() > largest:
-                raise _file_error(f"has an absolute value above {largest:g}", f"{path}:{name}")
+                raise _file_error(f"has an absolute value above {largest:g}", where)
             return array
 
         if not isinstance(document["method"], str):
@@ -241,7 +242,7 @@ def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Arr
 
 
 def natural_scales(phi: Array) -> Array:
-    """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
+    """Return typical sizes (16,) of [offsets; phi] for a load with this mass and centre of mass."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_LOAD_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
@@ -281,7 +282,7 @@ def _read_covariance(where: str, value: Any) -> Array:
         raise _file_error("contains values that are not numbers", where)
     covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
-        raise _file_error("has a negative variance", where)
+        raise _file_error(f"has a negative variance ({np.diag(covariance).min():g})", where)
     return np.where(unknown, np.inf, covariance)
 
 
@@ -304,15 +305,13 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
 
 
 def _read_degrees_of_freedom(where: str, value: Any) -> Array:
-    if not (
-        isinstance(value, list) and _contains_only_numbers([v for v in value if v is not None])
-    ):
+    given = value if isinstance(value, list) else [""]
+    if not _contains_only_numbers([v for v in given if v is not None]):
         raise _file_error("is not a list of 16 numbers or null", where)
-    degrees = finite_array(where, [0.0 if v is None else v for v in value], 16)
-    unknown = np.array([v is None for v in value])
-    if not (degrees[~unknown] > 0.0).all():
-        raise _file_error("has a value that is not positive", where)
-    return np.where(unknown, np.inf, degrees)
+    degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
+    if (degrees <= 0.0).any():
+        raise _file_error(f"has a value that is not positive ({degrees.min():g})", where)
+    return np.where([v is None for v in given], np.inf, degrees)
 
 
 SIGNIFICANT_STDS_BELOW_ZERO = 3.0
@@ -356,7 +355,10 @@ def _degrees_of_freedom_of_difference(total: Identification, gripper: Identifica
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation."""
+    """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation.
+
+    A negative eigenvalue means that no rigid body has this load, Eq. (T1).
+    """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
     length = np.sqrt(spread / mass) if spread > 0.0 else 1.0

@@ -58,7 +58,8 @@ class NoiseStd:
     Attributes:
         wrench: (6,) [N, N m]; None to estimate it from the residual.
         s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
-        walk: (12,), or 0: step per sample of random walks of [wrench, s, alpha].
+        walk: (12,) of the steps per sample of random walks of [wrench, s, alpha]; 0: no walk.
+        motion: (3, 3) rows s, omega, alpha.
     """
 
     wrench: ArrayLike | None = None
@@ -148,9 +149,7 @@ class SecondMoments:
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
-            what = "the fitted mass is 0: the mass cannot be identified from this wrench"
-            remedy = "check that the sensor is connected and that its orientation changes"
-            raise DrakeTeleopError(what, where="wrench", remedy=remedy)
+            raise unidentifiable_mass_error("the fitted mass is 0")
         covariance, degrees = self._covariance_and_degrees(theta, inverse)
         covariance = mark_undetermined(covariance, undetermined)
         degrees[undetermined] = np.inf
@@ -223,9 +222,8 @@ class SecondMoments:
         power = self.residual_squares(theta)
         if self._resolution is not None:
             absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
-            return *self._residual_variances_of_poses_at_rest(power, absorbed, theta), np.zeros(
-                6, dtype=bool
-            )
+            rest_variances = self._residual_variances_of_poses_at_rest(power, absorbed, theta)
+            return *rest_variances, np.zeros(6, dtype=bool)
         variances, degrees = self._unbiased_residual_variances(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
@@ -334,6 +332,11 @@ def identify(
     return equations.solve(delay_s)
 
 
+def unidentifiable_mass_error(what: str) -> DrakeTeleopError:
+    remedy = "check that the sensor is connected and that its orientation changes"
+    return DrakeTeleopError(f"{what}: the mass cannot be identified", where="wrench", remedy=remedy)
+
+
 @cache
 def regressor_coefficients() -> Array:
     """Return the constant T (6, 16, 19) with regressor [E V] = T z, Eq. (T4)."""
@@ -370,7 +373,10 @@ def centripetal_matrix(r: Array) -> Array:
 
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
-    """Return Gram matrix (16, 16) and right-hand side (16,) for [offsets; phi], from moments Z."""
+    """Return Gram matrix (16, 16) and right side (16,) for [offsets; phi], from Z = sum of z z^T.
+
+    `W` (6, 6) are the weights between the wrench channels.
+    """
     T = regressor_coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
@@ -380,7 +386,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T, residual r = F - [E V] theta, from moments Z."""
+    """Return the mean (6, 6) of r r^T, residual r = F - [E V] theta, from Z = mean of z z^T."""
     L = -np.einsum("cjk,j->ck", regressor_coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
@@ -393,7 +399,7 @@ def excited_columns(Z: Array) -> NDArray[np.bool_]:
 
 
 def root_of_pseudo_inverse(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """Return R (n, rank) such that R R^T is the pseudo-inverse of the Gram matrix."""
+    """Return R (n, rank) with R R^T the pseudo-inverse of the Gram matrix of the `used` columns."""
     return _root_and_eigensystem(gram, used)[0]
 
 

@@ -82,14 +82,13 @@ def parse_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the numbers in `tolerance` by [offsets; phi], over it."""
+    """Return derivatives (k, 16) of the required entries by [offsets; phi], over tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
     rows[1:4, 0], rows[1:4, 1:4] = -c / m, np.eye(3) / m
     # I_com = I - (h.h E - h h^T) / m with h = m c.
-    E = np.eye(3)
-    upper = np.triu_indices(3)
+    E, upper = np.eye(3), np.triu_indices(3)
     rows[4:, 0] = ((c @ c) * E - np.outer(c, c))[upper]
     for k in range(3):
         both = np.outer(E[k], c) + np.outer(c, E[k])
@@ -97,15 +96,14 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     rows[4:, 4:] = np.eye(6)
     # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
-    out, rows_of = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
-    for name in tolerance.required_quantity_names:
-        start, stop, size = rows_of[name]
-        out.append(rows[start:stop] / (size * getattr(tolerance, name)))
-    return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
+    parts = {"mass": (rows[:1], 1.0), "com": (rows[1:4], 1.0), "inertia": (rows[4:], scale)}
+    required = [(*parts[x], getattr(tolerance, x)) for x in tolerance.required_quantity_names]
+    out = np.concatenate([part / (size * limit) for part, size, limit in required])
+    return np.hstack([np.zeros((len(out), 6)), out])
 
 
 def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
-    """Return the standard deviations (k,) of numbers with a tolerance, divided by it."""
+    """Return standard deviations (k,) over tolerances; inf for undetermined entries."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", derivatives, finite, derivatives)
@@ -114,14 +112,14 @@ def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
 
 
 def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of the numbers in `tolerance` for load phi (10,) [kg, mm, kg m^2]."""
+    """Return the values (k,) of the required entries for a load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the absolute tolerances (k,) for a load phi (10,) [kg, mm, kg m^2]."""
+    """Return absolute tolerances (k,) of the required entries for load phi [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantity_names]

@@ -11,6 +11,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
+from drake_teleop.load.normal_equations import unidentifiable_mass_error
 
 _PSEUDO_INERTIA_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
 _CONSTRAINT_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
@@ -23,8 +24,8 @@ _MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     """Return [offsets; phi] (16,) of the rigid body that fits best.
 
-    `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
-    `right`.
+    `theta` (16,) solves the weighted normal equations `gram` and `right` without constraint; it is
+    returned if `gram` cannot separate load and offsets.
     """
     if is_physically_consistent(theta[6:]):
         return theta
@@ -43,9 +44,7 @@ def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
 def _scales_of_phi(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
-        what = "the fitted mass is 0: the mass cannot be identified from this wrench"
-        remedy = "check that the sensor is connected and its orientation changes"
-        raise DrakeTeleopError(what, where="wrench", remedy=remedy)
+        raise unidentifiable_mass_error("the fitted mass is 0")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
     L = max(_MIN_LENGTH_UNIT_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])

@@ -62,6 +62,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
+        equations: second moments of the kept samples.
     """
 
     identification: Identification
@@ -216,9 +217,8 @@ def identify_batch(
     )
     if gain_std > 0.0:
         known = np.isfinite(np.diag(covariance))
-        covariance += (
-            np.outer(known, known) * gain_std**2 * covariance_for_gain_errors(fit, offsets)
-        )
+        gain_covariance = gain_std**2 * covariance_for_gain_errors(fit, offsets)
+        covariance += np.outer(known, known) * gain_covariance
     identification = replace(
         plain,
         phi=theta[6:],

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import (
     NoiseStd,
@@ -21,6 +20,7 @@ from drake_teleop.load.normal_equations import (
     normal_equations,
     residual_covariance,
     root_of_pseudo_inverse,
+    unidentifiable_mass_error,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -37,7 +37,7 @@ class SolvedNormalEquations(NamedTuple):
         gram: (16, 16) Gram matrix per sample, compensated for noise.
         weights: (6, 6) weights between wrench channels.
         noise_scale: ratio of residual variance to specified noise variance.
-        map_from_ordinary: (16, 16) matrix from ordinary least squares to theta.
+        map_from_ordinary: (16, 16) matrix that maps the ordinary least squares theta to this one.
     """
 
     gram: Array
@@ -58,9 +58,7 @@ def total_least_squares(
     """
     Z, Q = moments.mean_products, moments.mean_noise_covariance_of_z(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
-        what = "the wrench is 0 throughout: the mass cannot be identified"
-        remedy = "check that the sensor is connected and that its orientation changes"
-        raise DrakeTeleopError(what, where="wrench", remedy=remedy)
+        raise unidentifiable_mass_error("the wrench is 0 throughout")
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _MIN_SIGNAL_STDS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)
@@ -109,7 +107,6 @@ def _solve_compensated_equations(
 
 
 def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: float) -> float:
-
     def determinant_condition(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
 

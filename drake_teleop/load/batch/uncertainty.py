@@ -184,11 +184,14 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 def covariance_for_white_noise(
     least_squares_covariance: Array, equations: SecondMoments, fit: EstimatorFit
 ) -> Array:
-    """Return the covariance (16, 16) of a fit, for noise correlated between channels only."""
+    """Return the covariance (16, 16) of [offsets; phi] by noise with the channel correlation of W.
+
+    W are the weights of `fit`; if they are diagonal, `least_squares_covariance` is returned.
+    """
     W, Z = fit.form.weights, fit.moments.mean_products
-    predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
         return least_squares_covariance
+    predicted = np.linalg.inv(W)
     scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
@@ -255,12 +258,12 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
 def covariance_of_solution(
     least_squares_covariance: Array, form: SolvedNormalEquations, offsets_estimated: bool
 ) -> Array:
-    """Return the covariance (16, 16) of the solution of `form`."""
+    """Return the covariance (16, 16) of `form.theta` from that of ordinary least squares."""
     unknown = np.isinf(np.diag(least_squares_covariance))
     covariance = np.where(unknown[:, None] | unknown, 0.0, least_squares_covariance)
     if not offsets_estimated:
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
-        covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
+        covariance -= covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
     covariance = form.map_from_ordinary @ covariance @ form.map_from_ordinary.T
     return mark_undetermined(covariance, unknown | form.is_undetermined)
