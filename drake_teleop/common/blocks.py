@@ -30,11 +30,9 @@ class DoubleOnly:
     __slots__ = ONE_DICT
 
     def _refuse_scalar_conversion(self, *_: Any) -> NoReturn:
-        raise DrakeTeleopError(
-            "has no AutoDiffXd or symbolic version: compiled code is for double only",
-            where=type(self).__name__,
-            remedy="use NonContactWrench or WrenchScaling, or linearize numerically",
-        )
+        what = "has no AutoDiffXd or symbolic version: compiled code is for double only"
+        remedy = "use NonContactWrench or WrenchScaling, or linearize numerically"
+        raise DrakeTeleopError(what, where=type(self).__name__, remedy=remedy)
 
     ToAutoDiffXd = ToSymbolic = _refuse_scalar_conversion
 

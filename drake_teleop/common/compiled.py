@@ -26,16 +26,8 @@ from numba.extending import intrinsic
 from drake_teleop.common.errors import DrakeTeleopError
 
 _TYPES_IDENTIFIED_BY_REPR = (
-    int,
-    float,
-    complex,
-    str,
-    bytes,
-    slice,
-    type(None),
-    type(...),
-    np.dtype,
-    np.generic,
+    *(int, float, complex, str, bytes, slice, type(None), type(...)),
+    *(np.dtype, np.generic),
 )
 
 
@@ -87,11 +79,9 @@ def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
 
 def address_of_function(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
     if not isinstance(function, Dispatcher):
-        raise DrakeTeleopError(
-            "is not compiled",
-            where=f"function {getattr(function, '__qualname__', function)}",
-            remedy="decorate it with @njit(cache=True) of drake_teleop.common.compiled",
-        )
+        where = f"function {getattr(function, '__qualname__', function)}"
+        remedy = "decorate it with @njit(cache=True) of drake_teleop.common.compiled"
+        raise DrakeTeleopError("is not compiled", where=where, remedy=remedy)
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
@@ -106,11 +96,9 @@ class _CacheFiles:
     def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
         function = dispatcher.py_func
         versions = f"{sys.implementation.cache_tag}.numba-{numba.__version__}"
-        self._folder = folder
-        self._dispatcher = dispatcher
-        self._prefix = (
-            f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}.{versions}-"
-        )
+        file = Path(function.__code__.co_filename).stem
+        self._folder, self._dispatcher = folder, dispatcher
+        self._prefix = f"{file}.{function.__qualname__}.{versions}-"
 
     def load(self, key: Any) -> Any:
         with (
@@ -223,7 +211,8 @@ def _constant_text(value: Any) -> str:
         return _qualified_name(value)
     if isinstance(value, _TYPES_IDENTIFIED_BY_REPR):
         return repr(value)
-    raise TypeError(f"a cached compiled function uses {value!r}, whose changes are not detected")
+    what = f"a cached compiled function uses {value!r}, whose changes are not detected"
+    raise TypeError(f"{what}; pass it as an argument")
 
 
 def _qualified_name(value: Any) -> str:

@@ -101,15 +101,12 @@ def short_text(value: Any) -> str:
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
     """Check field names and types of parsed YAML by a dataclass; `tagged` allows a YAML tag."""
     if not isinstance(data, dict):
-        raise DrakeTeleopError(
-            f"expected a mapping of fields, found {short_text(data)}",
-            where=where,
-            remedy=f"the fields are {', '.join(_field_names(schema))}",
-        )
+        what = f"expected a mapping of fields, found {short_text(data)}"
+        remedy = f"the fields are {', '.join(_field_names(schema))}"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
     if "_tag" in data and not tagged:
-        raise DrakeTeleopError(
-            f"the tag {data['_tag']} is not allowed here", where=where, remedy="remove the tag"
-        )
+        what = f"the tag {data['_tag']} is not allowed here"
+        raise DrakeTeleopError(what, where=where, remedy="remove the tag")
     kinds = _field_types(schema)
     for key, value in data.items():
         if key == "_tag":
@@ -142,11 +139,15 @@ def check_all_field_values(config: Any, where: str) -> None:
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_place(where, field.name)
         _check_field_value(field, kinds[field.name], value, place)
-        for index, item in enumerate(value if isinstance(value, list) else [value]):
+        for item_place, item in _items_with_places(value, place):
             if dataclasses.is_dataclass(item):
-                check_all_field_values(
-                    item, f"{place}[{index}]" if isinstance(value, list) else place
-                )
+                check_all_field_values(item, item_place)
+
+
+def _items_with_places(value: Any, place: str) -> list[tuple[str, Any]]:
+    if isinstance(value, list):
+        return [(f"{place}[{index}]", item) for index, item in enumerate(value)]
+    return [(place, value)]
 
 
 def _check_field_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
@@ -171,19 +172,16 @@ def _check_quantity_range(metadata: Any, value: Any, place: str) -> None:
     values = value if isinstance(value, list) else [value]
     length = metadata.get("length")
     if length is not None and len(values) != length:
-        raise DrakeTeleopError(
-            f"has {len(values)} numbers", where=place, remedy=f"give {length} numbers"
-        )
+        what = f"has {len(values)} numbers"
+        raise DrakeTeleopError(what, where=place, remedy=f"give {length} numbers")
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
         if not low <= number <= high:  # also false for NaN
-            raise DrakeTeleopError(
-                f"{short_text(number)}{unit} is outside "
-                f"{short_text(low)} to {short_text(high)}{unit}",
-                where=place,
-                remedy=f"check the value and its unit ({metadata['doc']})",
-            )
+            limits = f"{short_text(low)} to {short_text(high)}{unit}"
+            what = f"{short_text(number)}{unit} is outside {limits}"
+            remedy = f"check the value and its unit ({metadata['doc']})"
+            raise DrakeTeleopError(what, where=place, remedy=remedy)
 
 
 def _field_types(schema: type) -> dict[str, FieldType]:
@@ -252,18 +250,16 @@ def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> 
     elif first in TYPE_NAMES:
         if not _has_value_type(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _make_type_error(
-                TYPE_NAMES[first], value, place, remedy if first is float else ""
-            )
+            remedy = remedy if first is float else ""
+            raise _make_type_error(TYPE_NAMES[first], value, place, remedy)
     elif from_file:
         several = len(kind.items) > 1
         check_structure(_block_class_of_tag(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"make one: {first.__name__}(...), with fields {fields}"
-        raise _make_type_error(
-            " or ".join(block.__name__ for block in kind.items), value, place, remedy
-        )
+        expected = " or ".join(block.__name__ for block in kind.items)
+        raise _make_type_error(expected, value, place, remedy)
 
 
 def _block_class_of_tag(blocks: tuple[type, ...], value: Any, place: str) -> type:
@@ -369,12 +365,11 @@ def _lines_of_changed_fields(config: Any) -> Iterator[str]:
         value = getattr(config, entry.name)
         if value == _default_value(entry):
             continue
-        blocks = value if isinstance(value, list) else [value]
-        if not blocks or not dataclasses.is_dataclass(blocks[0]):
+        blocks = _items_with_places(value, entry.name)
+        if not blocks or not dataclasses.is_dataclass(blocks[0][1]):
             yield f"{entry.name}: {_format_value(value)}"
             continue
-        for index, block in enumerate(blocks):
-            place = f"{entry.name}[{index}]" if isinstance(value, list) else entry.name
+        for place, block in blocks:
             yield f"{place}: {type(block).__name__}"
             yield from (f"  {line}" for line in _lines_of_changed_fields(block))
 
@@ -393,7 +388,6 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    """Disable the checks of assigned values in this context."""
     token = _assignment_checks_enabled.set(False)
     try:
         yield
@@ -409,6 +403,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     lists, items, optional, is_mapping = _type_of_field(entry, entry.type)
     blocks = tuple(item for item in items if item not in TYPE_NAMES)
     metadata = entry.metadata
+    choices = *metadata.get("choices", ()), *(metadata.get("registry") or ())
     return FieldInfo(
         name=entry.name,
         kind="block" if blocks else TYPE_NAMES[items[0]].removeprefix("a "),
@@ -419,9 +414,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         unit=metadata.get("unit", ""),
         low=metadata.get("low"),
         high=metadata.get("high"),
-        choices=(*metadata["choices"], *(metadata.get("registry") or ()))
-        if "choices" in metadata
-        else (),
+        choices=choices if "choices" in metadata else (),
         blocks=blocks,
         meaning=metadata.get("doc") or (_first_docstring_line(blocks[0]) if blocks else ""),
         is_mapping=is_mapping,

@@ -72,10 +72,9 @@ def refuse_polars_in_forked_process() -> None:
     _POLARS_PROCESS_ID.append(os.getpid())
     del _POLARS_PROCESS_ID[1:]
     if [os.getpid()] != _POLARS_PROCESS_ID:
-        raise DrakeTeleopError(
-            "polars would hang in this process, which was forked after tables were read or written",
-            remedy='start processes by multiprocessing.get_context("spawn")',
-        )
+        what = "polars would hang in this process, which was forked after polars was used"
+        remedy = 'start processes by multiprocessing.get_context("spawn")'
+        raise DrakeTeleopError(what, remedy=remedy)
 
 
 def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
-_MAX_LISTED_FILES = 6  # maximum number of listed files
+_MAX_LISTED_FILES = 6
 _RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
@@ -58,9 +58,8 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise CannotWrite(
-            f"cannot be written ({_reason_of_failure(error)})", where=str(path)
-        ) from error
+        what = f"cannot be written ({_reason_of_failure(error)})"
+        raise CannotWrite(what, where=str(path)) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -108,11 +107,9 @@ def output_folder(
     try:
         yield
     except CannotWrite as error:
-        after = _file_times_and_inodes(out)
-        existing = [
-            name for name in after if name in valid_after_failure or before.get(name) != after[name]
-        ]
-        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(existing)}") from error
+        found = _file_times_and_inodes(out).items()
+        valid = [x for x, state in found if x in valid_after_failure or before.get(x) != state]
+        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_file_names(valid)}") from error
 
 
 def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -> None:
@@ -126,11 +123,8 @@ def refuse_to_replace_inputs(path: Path, input_path: str | Path | None = None) -
     if input_path is not None and os.path.isfile(input_path) and os.path.samefile(input_path, path):
         what = f"the input {path.name}"
     if what:
-        raise DrakeTeleopError(
-            f"contains {what}, which the results would replace",
-            where=str(path.parent),
-            remedy="give another --out",
-        )
+        what = f"contains {what}, which the results would replace"
+        raise DrakeTeleopError(what, where=str(path.parent), remedy="give another --out")
 
 
 def make_folder(folder: Path) -> None:
@@ -169,11 +163,9 @@ def remove_log(path: Path) -> None:
         return
     parts = sorted(path.glob(LOG_PARTS_PATTERN))
     if others := sorted(set(path.iterdir()) - set(parts)):
-        raise DrakeTeleopError(
-            f"contains {others[0].name}, which is not part of a log",
-            where=str(path),
-            remedy="give another folder for the log",
-        )
+        what = f"contains {others[0].name}, which is not part of a log"
+        remedy = "give another folder for the log"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     for part in reversed(parts):  # from the end: an interruption leaves no gap
         part.unlink()
 

@@ -69,18 +69,15 @@ def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...],
         leading = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
     except ValueError as error:
         shapes = ", ".join(f"{name} {table.shape}" for name, table in tables.items())
-        raise DrakeTeleopError(
-            f"the numbers of samples differ: {shapes}", remedy="give one row of each per sample"
-        ) from error
-    return leading, [
-        _broadcast_to_table(table, (*leading, table.shape[-1])) for table in tables.values()
-    ]
-
-
-def _broadcast_to_table(table: Array, shape: tuple[int, ...]) -> Array:
-    # numpy broadcasts to read-only arrays, another type, which would be compiled again.
-    same = table if table.shape == shape else np.array(np.broadcast_to(table, shape))
-    return np.ascontiguousarray(same).reshape(-1, shape[-1])
+        what, remedy = f"the numbers of samples differ: {shapes}", "give one row of each per sample"
+        raise DrakeTeleopError(what, remedy=remedy) from error
+    rows = []
+    for table in tables.values():
+        shape = (*leading, table.shape[-1])
+        # numpy broadcasts to read-only arrays, another type, which would be compiled again.
+        same = table if table.shape == shape else np.array(np.broadcast_to(table, shape))
+        rows.append(np.ascontiguousarray(same).reshape(-1, shape[-1]))
+    return leading, rows
 
 
 def to_float(name: str, value: Any) -> float:
@@ -88,22 +85,18 @@ def to_float(name: str, value: Any) -> float:
     try:
         if isinstance(value, (str, bytes)):
             raise TypeError
-        return float(
-            float_array(name, value) if isinstance(value, (np.generic, np.ndarray)) else value
-        )
+        of_numpy = isinstance(value, (np.generic, np.ndarray))
+        return float(float_array(name, value) if of_numpy else value)
     except (TypeError, ValueError, OverflowError):
-        raise DrakeTeleopError(
-            f"expected a number, found {reprlib.repr(value)}", where=name
-        ) from None
+        what = f"expected a number, found {reprlib.repr(value)}"
+        raise DrakeTeleopError(what, where=name) from None
 
 
 def check_nonzero_load(name: str, phi: Array) -> Array:
     if not phi.any():
-        raise DrakeTeleopError(
-            "all ten parameters are zero: the load is not identified",
-            where=name,
-            remedy="identify it first: identify_load for a scenario, identify_log for a log",
-        )
+        what = "all ten parameters are zero: the load is not identified"
+        remedy = "identify it first: identify_load for a scenario, identify_log for a log"
+        raise DrakeTeleopError(what, where=name, remedy=remedy)
     return phi
 
 
@@ -112,21 +105,16 @@ def positive_array(name: str, value: ArrayLike, *shape: int) -> Array:
     array = finite_array(name, value, *shape)
     if not (array >= 1.0 / MAX_ARRAY_VALUE).all():
         kind = "not positive" if (array <= 0.0).any() else f"below {1.0 / MAX_ARRAY_VALUE:g}"
-        raise DrakeTeleopError(
-            f"has the value {array.min():g}, which is {kind}",
-            where=name,
-            remedy="give values above 0",
-        )
+        what = f"has the value {array.min():g}, which is {kind}"
+        raise DrakeTeleopError(what, where=name, remedy="give values above 0")
     return array
 
 
 def nonnegative_array(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return an array as `finite_array`; raise DrakeTeleopError if a value is negative."""
     array = finite_array(name, value, *shape)
     if (array < 0.0).any():
-        raise DrakeTeleopError(
-            f"has the negative value {array.min():g}", where=name, remedy="give values of 0 or more"
-        )
+        what = f"has the negative value {array.min():g}"
+        raise DrakeTeleopError(what, where=name, remedy="give values of 0 or more")
     return array
 
 
@@ -151,10 +139,8 @@ def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
     times = np.asarray(t, float)
-    return [
-        (float(times[a]), float(times[b - 1]))
-        for a, b in find_runs_of_true(np.asarray(contact, bool))
-    ]
+    runs = find_runs_of_true(np.asarray(contact, bool))
+    return [(float(times[a]), float(times[b - 1])) for a, b in runs]
 
 
 def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
@@ -168,6 +154,6 @@ def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
 
 
 def position_of_parabola_minimum(left: float, middle: float, right: float) -> float:
-    """Return where a parabola through values at -1, 0 and 1 is least, limited to this interval."""
+    """Return the minimum of a parabola through values at -1, 0, 1, clipped; 0 without minimum."""
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

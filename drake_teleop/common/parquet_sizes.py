@@ -41,19 +41,15 @@ def _check_sizes_in_file(content: bytes | mmap.mmap) -> None:
     if end < len(_MAGIC_BYTES) or content[-len(_MAGIC_BYTES) :] != _MAGIC_BYTES:
         raise ValueError("it does not end with PAR1, as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
-    _require_undamaged(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
+    _require(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
     columns = list(_leaf_names_and_is_flat(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
-    _require_undamaged(
-        _read_size(footer, 3, "rows") == sum(rows),
-        "its row groups have other numbers of rows than the file",
-    )
+    same_rows = _read_size(footer, 3, "rows") == sum(rows)
+    _require(same_rows, "its row groups have other numbers of rows than the file")
     for group, count in zip(groups, rows, strict=True):
-        _require_undamaged(
-            len(group[1]) == len(columns), "a row group and the schema have different columns"
-        )
+        _require(len(group[1]) == len(columns), "a row group and the schema have different columns")
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
             _check_column(content, start, chunk[3], name, count if is_flat else None)
 
@@ -76,26 +72,23 @@ def _check_column(
     content: bytes | mmap.mmap, end: int, column: _ThriftStruct, name: str, rows: int | None
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
-    _require_undamaged(rows in (None, values), f"{name} has {values} values in {rows} rows")
+    _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
     largest = _read_size(column, 6, f"bytes in {name}")
     length = _read_size(column, 7, f"bytes in {name}")
     at = _read_size(column, 9, f"the first byte of {name}")
     at = min(at, _read_size(column, 11, f"the first byte of {name}", 0) or at)
-    _require_undamaged(at + length <= end, f"{name} goes beyond the end of the file")
+    _require(at + length <= end, f"{name} goes beyond the end of the file")
     found, where = 0, f"a page of {name}"
     while found < values:
         reader = _ThriftReader(content, at)
         page = reader.read_struct()
         length = _read_size(page, 3, f"bytes in {where}")
         at = reader.at + length
-        _require_undamaged(at <= end, f"{where} goes beyond the end of the file")
-        _require_undamaged(
-            _read_size(page, 2, f"bytes in {where}") <= largest, f"{where} is larger than {name}"
-        )
+        _require(at <= end, f"{where} goes beyond the end of the file")
+        size = _read_size(page, 2, f"bytes in {where}")
+        _require(size <= largest, f"{where} is larger than {name}")
         found += _count_values_of_page(page, length, where)
-    _require_undamaged(
-        found == values, f"the pages of {name} have {found} values instead of {values}"
-    )
+    _require(found == values, f"the pages of {name} have {found} values instead of {values}")
 
 
 def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
@@ -103,31 +96,27 @@ def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
     if kind == _DATA_PAGE_TYPE:
         return _read_size(page[5], 1, what)
     if kind == _DICTIONARY_PAGE_TYPE:
-        _require_undamaged(
-            _read_size(page[7], 1, what) <= page[2], f"{where} has fewer bytes than values"
-        )
+        values = _read_size(page[7], 1, what)
+        _require(values <= page[2], f"{where} has fewer bytes than values")
     if kind != _DATA_PAGE_V2_TYPE:
         return 0
     header = page[8]
     values = _read_size(header, 1, what)
-    _require_undamaged(
-        _read_size(header, 2, f"nulls in {where}") <= values, f"{where} has more nulls than values"
-    )
-    _require_undamaged(
-        _read_size(header, 3, f"rows in {where}") <= values, f"{where} has more rows than values"
-    )
+    for number, name in ((2, "nulls"), (3, "rows")):
+        size = _read_size(header, number, f"{name} in {where}")
+        _require(size <= values, f"{where} has more {name} than values")
     levels = sum(_read_size(header, number, f"bytes in {where}") for number in (5, 6))
-    _require_undamaged(levels <= length, f"{where} is shorter than its levels")
+    _require(levels <= length, f"{where} is shorter than its levels")
     return values
 
 
 def _read_size(struct: _ThriftStruct, number: int, what: str, default: int | None = None) -> int:
     size = struct[number] if default is None else struct.get(number, default)
-    _require_undamaged(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
+    _require(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
 
 
-def _require_undamaged(condition: bool, otherwise: str) -> None:
+def _require(condition: bool, otherwise: str) -> None:
     if not condition:
         raise ValueError(f"it is damaged: {otherwise}")
 
@@ -137,7 +126,7 @@ class _ThriftReader:
         self._content, self.at = content, at
 
     def read_struct(self, depth: int = 0) -> _ThriftStruct:
-        _require_undamaged(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
+        _require(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
         fields: _ThriftStruct = {}
         number = 0
         while head := self._read_byte():
@@ -157,18 +146,18 @@ class _ThriftReader:
             return self._read_list(depth)
         if kind <= _BYTE_TYPE:  # a boolean in a list has its own byte
             return self._read_byte()
-        _require_undamaged(kind == _DOUBLE_TYPE, "its metadata has an unknown type")
+        _require(kind == _DOUBLE_TYPE, "its metadata has an unknown type")
         return self._read_bytes(8)
 
     def _read_list(self, depth: int) -> list[Any]:
-        _require_undamaged(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
+        _require(depth < _MAX_METADATA_NESTING, "its metadata is nested too deeply")
         head = self._read_byte()
         size = head >> 4 if head >> 4 < 15 else self._read_varint()
         return [self._read_value(head & 15, depth + 1) for _ in range(size)]
 
     def _read_bytes(self, size: int) -> bytes:
         at, self.at = self.at, self.at + size
-        _require_undamaged(self.at <= len(self._content), "its metadata goes beyond its end")
+        _require(self.at <= len(self._content), "its metadata goes beyond its end")
         return bytes(self._content[at : self.at])
 
     def _read_byte(self) -> int:

@@ -42,15 +42,11 @@ class Registry(dict[str, _Part]):
         if part is None:
             return partial(self.register, name)
         if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
-            raise DrakeTeleopError(
-                f"{name!r} is not a valid name",
-                where=self.kind,
-                remedy="use only letters, digits, _ . -, first a letter, digit, _ or .",
-            )
+            remedy = "use only letters, digits, _ . -, first a letter, digit, _ or ."
+            raise DrakeTeleopError(f"{name!r} is not a valid name", where=self.kind, remedy=remedy)
         if name in self.shipped:
-            raise DrakeTeleopError(
-                f"'{name}' is the name of a shipped part", where=self.kind, remedy="use another"
-            )
+            what = f"'{name}' is the name of a shipped part"
+            raise DrakeTeleopError(what, where=self.kind, remedy="use another")
         self._check_type(name, part)
         self[name] = part
         return part
@@ -64,19 +60,15 @@ class Registry(dict[str, _Part]):
             fits = isinstance(part, self._part_type)
         if not fits:
             kind = "a class derived from " if self._parts_are_classes else ""
-            raise DrakeTeleopError(
-                f"'{name}' is {reprlib.repr(part)}",
-                where=self.kind,
-                remedy=f"register {kind}{self._part_type.__name__} (docs/extend.md)",
-            )
+            remedy = f"register {kind}{self._part_type.__name__} (docs/extend.md)"
+            what = f"'{name}' is {reprlib.repr(part)}"
+            raise DrakeTeleopError(what, where=self.kind, remedy=remedy)
 
     def remove(self, name: str) -> None:
         if name in self.shipped:
-            raise DrakeTeleopError(
-                f"'{name}' is a shipped part and cannot be removed",
-                where=self.kind,
-                remedy="remove only parts that you registered",
-            )
+            what = f"'{name}' is a shipped part and cannot be removed"
+            remedy = "remove only parts that you registered"
+            raise DrakeTeleopError(what, where=self.kind, remedy=remedy)
         del self[self.check(name)]
 
     def check(self, name: Any, where: str = "", *others: str) -> str:
@@ -98,9 +90,8 @@ def register_from_script(script: Path) -> None:
     """Import a Python file that registers parts, here and in the processes of studies."""
     script = script.absolute()
     if script.suffix != ".py" or not script.is_file():
-        raise DrakeTeleopError(
-            "is not a Python file", where=str(script), remedy="give an existing .py file"
-        )
+        remedy = "give an existing .py file"
+        raise DrakeTeleopError("is not a Python file", where=str(script), remedy=remedy)
     sys.path.append(str(script.parent))
     try:
         module = import_module(script.stem)

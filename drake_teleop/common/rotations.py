@@ -17,7 +17,6 @@ NUM_COLUMNS_OF_ROTATION_FORM = {
 }
 """Number of columns of each form."""
 
-
 EULER_AXES = tuple(
     axes
     for letters in ("xyz", "XYZ")

@@ -39,9 +39,8 @@ class _YamlLoader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if (
-            self.flow_level >= _MAX_BRACKET_NESTING
-        ):  # PyYAML scans thousands before it creates nodes
+        # PyYAML scans thousands of brackets before it creates nodes.
+        if self.flow_level >= _MAX_BRACKET_NESTING:
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
@@ -91,9 +90,8 @@ def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
     except yaml.YAMLError as error:
         raise DrakeTeleopError(f"is not YAML ({error})", where=where) from None
     except RecursionError:
-        raise DrakeTeleopError(
-            "is nested too deeply", where=where, remedy="use fewer levels of lists and mappings"
-        ) from None
+        remedy = "use fewer levels of lists and mappings"
+        raise DrakeTeleopError("is nested too deeply", where=where, remedy=remedy) from None
 
 
 def to_yaml_text(
@@ -111,11 +109,9 @@ def to_yaml_text(
         lines.append(f"{line}  # {comment}" if comment else line)
     text = "\n".join(lines) + "\n"
     if parse_yaml(text, "YAML", tagged=True) != data:
-        raise DrakeTeleopError(
-            f"{reprlib.repr(data)} cannot be written",
-            where="YAML",
-            remedy="use numbers, texts, lists and mappings",
-        )
+        what = f"{reprlib.repr(data)} cannot be written"
+        remedy = "use numbers, texts, lists and mappings"
+        raise DrakeTeleopError(what, where="YAML", remedy=remedy)
     return text
 
 
@@ -140,9 +136,8 @@ def read_json(path: str | Path) -> Any:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
-                raise DrakeTeleopError(
-                    "is defined twice", where=field_place(where, name), remedy="remove one"
-                )
+                place = field_place(where, name)
+                raise DrakeTeleopError("is defined twice", where=place, remedy="remove one")
             found[name] = value
         return found
 
@@ -155,9 +150,8 @@ def read_json(path: str | Path) -> Any:
         what = f"is not JSON (line {error.lineno}: {error.msg})"
         raise DrakeTeleopError(what, where=where) from None
     except RecursionError:
-        raise DrakeTeleopError(
-            "is nested too deeply", where=str(path), remedy="use fewer levels of lists and objects"
-        ) from None
+        remedy = "use fewer levels of lists and objects"
+        raise DrakeTeleopError("is nested too deeply", where=where, remedy=remedy) from None
 
 
 def read_text(path: str | Path) -> str:
@@ -191,22 +185,19 @@ class _NodeConverter:
         found: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
-                raise _error_at_node(
-                    f"a field's name is a word, not {_quote_value(key.value)}", key, place
-                )
+                what = f"a field's name is a word, not {_quote_value(key.value)}"
+                raise _error_at_node(what, key, place)
             field = field_place(place, key.value)
             if key.value in found:
                 raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":
-                raise _error_at_node(
-                    "there is no such field", key, field, "select a type by a YAML tag: !Type {...}"
-                )
+                remedy = "select a type by a YAML tag: !Type {...}"
+                raise _error_at_node("there is no such field", key, field, remedy)
             found[key.value] = self.convert_node(value, field)
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
-                raise _error_at_node(
-                    f"the tag {_quote_value(node.tag)} is not allowed here", node, place
-                )
+                what = f"the tag {_quote_value(node.tag)} is not allowed here"
+                raise _error_at_node(what, node, place)
             found["_tag"] = node.tag
         return found
 
@@ -216,9 +207,8 @@ def _convert_scalar(node: Any, place: str) -> Any:
     if kind == "str":
         return text
     if kind not in _SCALAR_PATTERNS or not _SCALAR_PATTERNS[kind].match(text):
-        raise _error_at_node(
-            f"{_quote_value(text)} does not match the tag {_quote_value(node.tag)}", node, place
-        )
+        what = f"{_quote_value(text)} does not match the tag {_quote_value(node.tag)}"
+        raise _error_at_node(what, node, place)
     if kind == "null":
         return None
     if kind == "bool":

@@ -22,7 +22,6 @@ def vector_at(x, i):
 
 @register_jitable
 def quaternion_at(x, i):
-    """Return the 4 numbers of x from index i as a quaternion [w, x, y, z]."""
     return x[i], x[i + 1], x[i + 2], x[i + 3]
 
 
@@ -196,27 +195,14 @@ def quaternion_of_matrix(R):
     """Return the unit quaternion of a rotation matrix (3, 3) (Shepperd 1978)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     largest = max(trace, R[0, 0], R[1, 1], R[2, 2])
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
     if largest == trace:
-        a = (1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+        a = (1.0 + trace, x, y, z)
     elif largest == R[0, 0]:
-        a = (
-            R[2, 1] - R[1, 2],
-            1.0 + 2.0 * R[0, 0] - trace,
-            R[0, 1] + R[1, 0],
-            R[0, 2] + R[2, 0],
-        )
+        a = (x, 1.0 + 2.0 * R[0, 0] - trace, xy, xz)
     elif largest == R[1, 1]:
-        a = (
-            R[0, 2] - R[2, 0],
-            R[0, 1] + R[1, 0],
-            1.0 + 2.0 * R[1, 1] - trace,
-            R[1, 2] + R[2, 1],
-        )
+        a = (y, xy, 1.0 + 2.0 * R[1, 1] - trace, yz)
     else:
-        a = (
-            R[1, 0] - R[0, 1],
-            R[0, 2] + R[2, 0],
-            R[1, 2] + R[2, 1],
-            1.0 + 2.0 * R[2, 2] - trace,
-        )
+        a = (z, xz, yz, 1.0 + 2.0 * R[2, 2] - trace)
     return normalized_quaternion(a)

@@ -132,9 +132,8 @@ def scaled_wrench(
     out = np.empty_like(rows[0])
     _scaled_wrenches_of_rows(*rows, *phis, *scales, out)
     if weights != inertias and gravity is not None:
-        _, (down, _) = broadcast_to_rows(
-            gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6)
-        )
+        wrenches = rows[0].reshape(*leading, 6)
+        _, (down, _) = broadcast_to_rows(gravity=(gravity, 3), wrench=(wrenches, 6))
         excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
         _add_excess_weights_of_rows(down, *phis, *excess, out)
     return out.reshape(*leading, 6)
@@ -152,9 +151,8 @@ def weight_scales_and_inertia_scales(
 
 
 def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        "is unknown, but the scales of weight and inertia differ", where=where, remedy=remedy
-    )
+    what = "is unknown, but the scales of weight and inertia differ"
+    return DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:

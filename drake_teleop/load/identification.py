@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -153,10 +153,9 @@ class Identification:
         known = (*cls.__dataclass_fields__, *_DERIVED_FIELDS, "verdicts")
         for name in (*known, *document):
             if name not in known:
-                problem = "is not a field of identification.json"
-                raise DrakeTeleopError(problem, where=f"{path}:{name}")
+                raise _file_error("is not a field of identification.json", f"{path}:{name}")
             if name not in document and name not in _OPTIONAL_FILE_FIELDS:
-                raise DrakeTeleopError("is missing", where=f"{path}:{name}")
+                raise _file_error("is missing", f"{path}:{name}")
 
         def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
             where = f"{path}:{name}"
@@ -169,17 +168,16 @@ class Identification:
 
         if not isinstance(document["method"], str):
             raise _file_error("is not a text", f"{path}:method")
-        readers: dict[str, Callable[[str, Any], Any]] = {
-            "weight_removed": _read_flag,
-            "degrees_of_freedom": _read_degrees_of_freedom,
-            "prior_dominated": _read_flags,
-        }
-        optional = {
-            k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
-        }
-        phi = check_nonzero_load(
-            f"{path}:phi", read_number_array("phi", 10, largest=_MAX_FILE_VALUE)
-        )
+        optional: dict[str, Any] = {}
+        for name, read in (
+            ("weight_removed", _read_flag),
+            ("degrees_of_freedom", _read_degrees_of_freedom),
+            ("prior_dominated", _read_flags),
+        ):
+            if name in document:
+                optional[name] = read(f"{path}:{name}", document[name])
+        phi = read_number_array("phi", 10, largest=_MAX_FILE_VALUE)
+        check_nonzero_load(f"{path}:phi", phi)
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise _file_error("has the mass 0", f"{path}:phi")
         result = cls(
@@ -195,9 +193,8 @@ class Identification:
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise _file_error(
-                "contradicts phi, covariance, identifiable or prior_dominated", f"{path}:verdicts"
-            )
+            others = "phi, covariance, identifiable or prior_dominated"
+            raise _file_error(f"contradicts {others}", f"{path}:verdicts")
         for name, value in result._derived_quantities().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -253,11 +250,8 @@ def _read_document(path: str | Path) -> dict[str, Any]:
     from drake_teleop.common.texts import read_json  # the import of PyYAML is slow
 
     if not os.path.exists(path):
-        raise DrakeTeleopError(
-            "cannot be read (no such file)",
-            where=str(path),
-            remedy="check the path, or run `identify` first",
-        )
+        what, remedy = "cannot be read (no such file)", "check the path, or run `identify` first"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     document = read_json(path)
     if not isinstance(document, dict):
         raise _file_error("is not a JSON object", str(path))
@@ -297,11 +291,10 @@ def _read_flag(where: str, value: Any) -> bool:
 
 
 def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
-    if not (
-        isinstance(value, list) and len(value) == 16 and all(isinstance(v, bool) for v in value)
-    ):
+    flags = value if isinstance(value, list) else []
+    if len(flags) != 16 or not all(isinstance(flag, bool) for flag in flags):
         raise _file_error("is not a list of 16 true or false", where)
-    return np.array(value, dtype=bool)
+    return np.array(flags, dtype=bool)
 
 
 def _read_degrees_of_freedom(where: str, value: Any) -> Array:
@@ -357,7 +350,7 @@ def _degrees_of_freedom_of_difference(total: Identification, gripper: Identifica
 def consistency_margin(load: Identification) -> tuple[float, float]:
     """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation.
 
-    A negative eigenvalue means that no rigid body has this load, Eq. (T1).
+    No rigid body has a negative one.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

@@ -64,9 +64,8 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
     J = finite_array("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
-        raise DrakeTeleopError(
-            "the pseudo-inertia is not symmetric", where="J", remedy="give, say, (J + J.T) / 2"
-        )
+        what = "the pseudo-inertia is not symmetric"
+        raise DrakeTeleopError(what, where="J", remedy="give, say, (J + J.T) / 2")
     Sigma = J[:3, :3]
     I = np.trace(Sigma) * np.eye(3) - Sigma  # noqa: E741
     return np.concatenate([[J[3, 3]], J[:3, 3], I[np.triu_indices(3)]])

@@ -107,10 +107,8 @@ class SecondMoments:
     @property
     def mean_products(self) -> Array:
         if self.num_samples < 3:
-            raise DrakeTeleopError(
-                f"{self.num_samples:.3g} samples cannot determine a load",
-                remedy="give at least 3, in different orientations",
-            )
+            what = f"{self.num_samples:.3g} samples cannot determine a load"
+            raise DrakeTeleopError(what, remedy="give at least 3, in different orientations")
         return self._sums / self.num_samples
 
     def add_samples(
@@ -139,9 +137,8 @@ class SecondMoments:
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
         products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
-        for std, J in zip(
-            noise.motion[1], omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19), strict=True
-        ):
+        jacobians = omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19)
+        for std, J in zip(noise.motion[1], jacobians, strict=True):
             Q += std**2 * J.T @ products @ J
         return Q
 
@@ -180,10 +177,8 @@ class SecondMoments:
         if self._resolution is not None:  # three channels share one variance
             shares, degrees = shares.reshape(2, 3, 16).sum(axis=1), degrees[::3]
         total, square_sums = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
-        known = (total > 0.0) & (square_sums > 0.0)
-        return parts.sum(axis=0), np.divide(
-            total**2, square_sums, out=np.full(16, np.inf), where=known
-        )
+        known, infinite = (total > 0.0) & (square_sums > 0.0), np.full(16, np.inf)
+        return parts.sum(axis=0), np.divide(total**2, square_sums, out=infinite, where=known)
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited_columns)
@@ -281,9 +276,8 @@ class SecondMoments:
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
         left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.num_samples - len(groups))
         within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
-        f_ratio = np.divide(
-            between, left * within, out=np.zeros(2), where=(left > 0.0) & (within > 0.0)
-        )
+        testable = (left > 0.0) & (within > 0.0)
+        f_ratio = np.divide(between, left * within, out=np.zeros(2), where=testable)
         differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), f_ratio) < _POSE_F_TEST_LEVEL
         degrees = np.where(differ, left, left + repeats)
         squares = np.where(differ, between, squares)

@@ -47,9 +47,7 @@ class Tolerance(NamedTuple):
     @property
     def required_entry_names(self) -> tuple[str, ...]:
         """Names (k,) of the numbers that have a tolerance, such as "com x"."""
-        return tuple(
-            entry for name in self.required_quantity_names for entry in NAMES_OF_ENTRIES[name]
-        )
+        return sum((NAMES_OF_ENTRIES[name] for name in self.required_quantity_names), ())
 
     def __str__(self) -> str:
         return ", ".join(
@@ -63,17 +61,15 @@ def parse_tolerance(text: str) -> Tolerance:
     found: dict[str, float] = {}
     for part in text.split(","):
         match = _TOLERANCE_PATTERN.fullmatch(part)
-        name, unit = (match[1], match[3]) if match else ("", "")
+        name, number, unit = match.groups() if match else ("", "0", "m")
         try:
-            value = float(match[2]) * _SI_VALUE_OF_UNIT[unit] if match else 0.0
+            value = float(number) * _SI_VALUE_OF_UNIT[unit]
         except ValueError:
-            value = 0.0
+            name = ""
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
-            raise DrakeTeleopError(
-                f"{part.strip()!r} is no tolerance (quantity, number, unit), or repeats a quantity",
-                where=text,
-                remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
-            )
+            what = f"{part.strip()!r} is no tolerance (quantity, number, unit) or a repeated one"
+            remedy = "write, say, mass 0.5 %, com 0.5 mm, inertia 5 %"
+            raise DrakeTeleopError(what, where=text, remedy=remedy)
         if not _MIN_TOLERANCE <= value <= _MAX_TOLERANCE:
             what = f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)"
             raise DrakeTeleopError(what, where=text, remedy="correct the number or its unit")
@@ -122,7 +118,6 @@ def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
     """Return absolute tolerances (k,) of the required entries for load phi [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
-    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantity_names]
-    return np.repeat(
-        sizes, [len(NAMES_OF_ENTRIES[name]) for name in tolerance.required_quantity_names]
-    )
+    names = tolerance.required_quantity_names
+    sizes = [scales[name] * getattr(tolerance, name) for name in names]
+    return np.repeat(sizes, [len(NAMES_OF_ENTRIES[name]) for name in names])

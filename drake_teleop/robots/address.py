@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """Parsed address; `allowed` names its parameters, `port` and `host` are defaults."""
+    """Parsed address; `allowed` are names of parameters, `port` and `host` defaults."""
 
     def __init__(
         self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
@@ -25,13 +25,9 @@ class Address:
             raise DrakeTeleopError("has no host", where=text, remedy=f"use {parts.scheme}://HOST")
         self.path = parts.path.strip("/")
         self._parameters = parameters
-        for name in parameters:
-            if name not in allowed:
-                raise DrakeTeleopError(
-                    f"unknown parameter {name!r}",
-                    where=text,
-                    remedy=f"use {', '.join(allowed)}",
-                )
+        if unknown := parameters.keys() - set(allowed):
+            what = f"unknown parameter {min(unknown)!r}"
+            raise DrakeTeleopError(what, where=text, remedy=f"use {', '.join(allowed)}")
 
     def optional_parameter(self, name: str) -> str | None:
         return self._parameters.get(name)
@@ -45,29 +41,22 @@ class Address:
         except ValueError:
             values = []
         if len(values) != count or not all(0.0 < value < math.inf for value in values):
-            raise DrakeTeleopError(
-                f"{name}={text!r} is not {count} positive numbers",
-                where=self.text,
-                remedy="separate them by commas",
-            )
+            what = f"{name}={text!r} is not {count} positive numbers"
+            raise DrakeTeleopError(what, where=self.text, remedy="separate them by commas")
         return values
 
     def parameter_among_words(self, name: str, among: tuple[str, ...]) -> str:
         """Return a parameter, one of the words `among` (default: the first)."""
         text = self._parameters.get(name, among[0])
         if text not in among:
-            raise DrakeTeleopError(
-                f"{name}={text!r} is unknown",
-                where=self.text,
-                remedy=f"give {' or '.join(among)}",
-            )
+            what, remedy = f"{name}={text!r} is unknown", f"give {' or '.join(among)}"
+            raise DrakeTeleopError(what, where=self.text, remedy=remedy)
         return text
 
     def wrench_sign(self) -> float:
-        """Return 1 or -1: factor to the wrench of sensor on load, Eq. (1)."""
+        """Return 1 or -1: sign of the reported wrench relative to sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
-            raise DrakeTeleopError(
-                f"sign={text!r} is unknown", where=self.text, remedy="give 1 or -1"
-            )
+            what = f"sign={text!r} is unknown"
+            raise DrakeTeleopError(what, where=self.text, remedy="give 1 or -1")
         return -1.0 if text == "-1" else 1.0

@@ -42,9 +42,9 @@ from drake_teleop.robots.streams import (
 from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, white_wrench_noise
 
 DELAY_FORGETTING_TIME_S = 10.0
-"""Time constant of the weights [s]."""
+"""Time constant by which the estimate forgets samples [s]."""
 MAX_DELAY_STD_S = 5e-4
-"""Maximum standard deviation of a usable estimate [s]."""
+"""Maximum standard deviation of an estimate that changes the delay [s]."""
 MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
@@ -68,17 +68,14 @@ class DelayTracker:
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
     ) -> None:
         self.delay_s = delay_s
-        self._phi, self._noise = (
-            tuple(phi_with_inertia_replaced(load)[0]),
-            white_wrench_noise(load, dt, cutoff_hz),
-        )
+        self._phi = tuple(phi_with_inertia_replaced(load)[0])
+        self._noise = white_wrench_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
         self._reset_estimate(-math.inf)
+        # Load compiled code before the first sample.
         self.update_delay((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
-        self._reset_estimate(
-            -math.inf
-        )  # the call above loads compiled code before the first sample
+        self._reset_estimate(-math.inf)
 
     def _reset_estimate(self, t: float) -> None:
         self._t = self._fitted = t
@@ -115,11 +112,8 @@ class DelayTracker:
     def _is_inlier(self, residual: Array, slope: Array) -> bool:
         starting = self._samples < _MIN_DELAY_SAMPLES
         limit = _MAX_INLIER_RESIDUAL_SIGMAS * self._noise + self._delay_error * np.abs(slope)
-        limit += (
-            LOAD_WRENCH_ERROR_FRACTION * np.abs(self._wrenches[0])
-            + starting * MAX_SENSOR_OFFSET_DRIFT
-        )
-        offsets = self._offsets
+        drift, offsets = starting * MAX_SENSOR_OFFSET_DRIFT, self._offsets
+        limit += LOAD_WRENCH_ERROR_FRACTION * np.abs(self._wrenches[0]) + drift
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
@@ -139,9 +133,8 @@ class DelayTracker:
             max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
-            self._delay_error = min(
-                INLIER_DELAY_ERROR_AT_START_S, INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
-            )
+            tracked = INLIER_DELAY_ERROR_TRACKED_S + abs(correction)
+            self._delay_error = min(INLIER_DELAY_ERROR_AT_START_S, tracked)
 
 
 _GRAVITY_W = np.array([0.0, 0.0, -9.81])
@@ -163,26 +156,21 @@ class WrenchAndMotionStreams(Source):
         streams = (wrench if motion is None else motion).streams
         self.motion_stream = next((stream for stream in (POSE, IMU) if stream in streams), "")
         if not self.motion_stream:
-            raise DrakeTeleopError(
-                "delivers no motion",
-                where=where,
-                remedy="give --motion, such as rtde://HOST, or for ROS 2 pose=, tf= or imu= in the"
-                " address",
-            )
+            remedy = "give --motion, such as rtde://HOST, or for ROS 2 pose=, tf= or imu= in the"
+            raise DrakeTeleopError("delivers no motion", where=where, remedy=f"{remedy} address")
         self.streams = WRENCH, self.motion_stream
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """Return the received readings with their times of arrival; None at the end."""
         motions = self._motion.read(0.0) or [] if self._motion is not None else []
         moved = time.monotonic()
         readings = self._wrench.read(timeout_s)
         if readings is None:
             return None
-        now, alone = time.monotonic(), self._motion is None
+        now = time.monotonic()
+        if self._motion is not None:
+            readings = [each for each in readings if each.stream == WRENCH]
         found = [each._replace(arrival=moved) for each in motions if each.stream != WRENCH]
-        return found + [
-            each._replace(arrival=now) for each in readings if alone or each.stream == WRENCH
-        ]
+        return found + [each._replace(arrival=now) for each in readings]
 
     def close(self) -> None:
         self._wrench.close()
@@ -283,9 +271,8 @@ class MotionWindow:
 
     def _row_of_valid_motion(self, sample: Reading) -> Array | None:
         values = sample.values
-        if sample.flags or not (
-            abs(sample.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
-        ):
+        plausible = abs(sample.t) < _MAX_TIME_STAMP_S and (np.abs(values) < _MAX_MOTION_VALUE).all()
+        if sample.flags or not plausible:
             return None
         if sample.stream == IMU:
             return values
@@ -302,10 +289,8 @@ class MotionWindow:
             return np.concatenate([smooth, first[3:]])
         R_WS = rows[self._size // 2, :9].reshape(3, 3)
         omega, alpha = R_WS.T @ first[:9].reshape(3, 3), R_WS.T @ (2.0 * second[:9]).reshape(3, 3)
-        s = R_WS.T @ (2.0 * second[9:] - self._gravity_W)
-        return np.concatenate(
-            [s, *vectors_of_skew_parts(np.stack([omega, alpha])), R_WS.T @ self._gravity_W]
-        )
+        s, gravity = R_WS.T @ (2.0 * second[9:] - self._gravity_W), R_WS.T @ self._gravity_W
+        return np.concatenate([s, *vectors_of_skew_parts(np.stack([omega, alpha])), gravity])
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
@@ -348,13 +333,10 @@ class ReadingAssembler(Source):
         if weight_removed and streams.motion_stream == IMU:
             raise removed_weight_needs_orientation_error("the source")
         self._streams, self._delay, self.dt = streams, delay_s, streams.dt
-        self._tracker = None
-        if track is not None:
-            self._tracker = DelayTracker(track, self.dt, cutoff_hz, delay_s)
+        self._tracker = None if track is None else DelayTracker(track, self.dt, cutoff_hz, delay_s)
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)
-        self.lag_s = max(0.0, delay_s)
-        if cutoff_hz is not None:
-            self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / cutoff_hz + delay_s)
+        half_window_s = 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / (cutoff_hz or math.inf)
+        self.lag_s = max(0.0, half_window_s + delay_s)
         self._clocks = _StreamClockOffset(), _StreamClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
         self._pending: deque[Reading] = deque(maxlen=round(_STREAM_BUFFER_S / self.dt))
@@ -364,7 +346,6 @@ class ReadingAssembler(Source):
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """Return the readings completed within `timeout_s` [s]; None after the last wrench."""
         arrived = self._streams.read(timeout_s)
         if arrived is None:
             return None

@@ -84,7 +84,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> RecordEvaluation:
-    """Identify a record's load; compare its uncertainty with the tolerance."""
+    """Identify a record's load; compare its uncertainty with the tolerance; advise a motion."""
     count, found, why = len(tolerance.required_entry_names), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -111,9 +111,8 @@ def evaluate_record(
     elif changes:
         advice = _RESTART_ADVICE.format(t=min(changes))
     else:
-        advice = advise_motion(
-            log.motion, log.dt, cutoff_hz, derivatives_over_tolerances(tolerance, phi), noise
-        )
+        errors = derivatives_over_tolerances(tolerance, phi)
+        advice = advise_motion(log.motion, log.dt, cutoff_hz, errors, noise)
     t = 0.0 if log is None else float(log.t[-1])
     return RecordEvaluation(t, found, why, half, sure, known, doubts, advice)
 
@@ -121,15 +120,14 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return (k,) each: half-widths (95 %, `TOLERANCE_CONFIDENCE`), degrees of freedom."""
+    """Return half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom, (k,) each."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
-    half, sure = (
-        stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, TOLERANCE_CONFIDENCE)
-    )
+    levels = 0.95, TOLERANCE_CONFIDENCE
+    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in levels)
     return half, sure, degrees
 
 
@@ -151,13 +149,12 @@ def advise_motion(
 ) -> str:
     """Return as text the next motion that reduces the uncertainty most.
 
-    `motion` is s, omega, alpha of the record, (N, 3) each.
+    `motion` is s, omega, alpha, (N, 3) each; `errors`: `derivatives_over_tolerances`; `noise` (6,)
+    [N, N m].
     """
-    rate = (
-        1.0 / dt
-        if cutoff_hz is None
-        else min(1.0 / dt, _INDEPENDENT_SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
-    )
+    rate = 1.0 / dt
+    if cutoff_hz is not None:
+        rate = min(rate, _INDEPENDENT_SAMPLES_PER_CUTOFF_PERIOD * cutoff_hz)
     equations = SecondMoments(noise)
     equations.add_samples(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
@@ -243,9 +240,8 @@ def calibrate(
                 for reading in readings:
                     recorder.add(reading)
                     if pending is None and recorder.longest_part_s >= next_length_s:
-                        next_length_s = max(
-                            FIRST_RECORD_S, RECORD_GROWTH_FACTOR * recorder.longest_part_s
-                        )
+                        grown_s = RECORD_GROWTH_FACTOR * recorder.longest_part_s
+                        next_length_s = max(FIRST_RECORD_S, grown_s)
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):

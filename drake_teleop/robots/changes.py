@@ -36,7 +36,7 @@ _UNTESTED_READING_FLAGS = ~int(NONZERO_WRENCH_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_TEST_SPACING_S, _MAX_PAUSE_IN_FLAGGED_TIME_S, _MIN_REPORTED_CHANGE_SPACING_S = 10.0, 1.0, 1.0
 _MIN_TESTED_RECORD_S, _KIND_LIKELIHOOD_RATIO = 4.0, 40.0
-_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2 = 0.5  # m/s^2, standard deviation
+_MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2 = 0.5
 _CHANGE_TEST_NICENESS, _CHANGE_TEST_TIMEOUT_S = 10, 60.0
 
 TimedChangeText = tuple[float, str]
@@ -71,9 +71,8 @@ class ChangeMonitor:
         elif t - self._last_flagged > _MAX_PAUSE_IN_FLAGGED_TIME_S:
             self._flagged_since = math.inf
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
-            self._next_attempt = t + min(
-                max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since)), _MAX_TEST_SPACING_S
-            )
+            spacing_s = max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since))
+            self._next_attempt = t + min(spacing_s, _MAX_TEST_SPACING_S)
             find = _find_changes_in_process if self._live else find_zero_and_load_changes
             self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
         if self._pending is not None and (self._pending.done() or not self._live):
@@ -137,10 +136,8 @@ def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
 def _is_change_kind_certain(state: FittedModel, time: float) -> bool:
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE_SIGNALS]
-    if (
-        len(after) == 0
-        or np.linalg.norm(after.std(axis=0)) < _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2
-    ):
+    min_std = _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2
+    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < min_std:
         return False
     own = next(step for step in steps if step.time == time)
     other = StepChange("offsets" if own.kind == "load" else "load", own.time)

@@ -40,9 +40,8 @@ class TareRequestPort:
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
-            self._socket.sendto(
-                (tare() if valid else "unknown request: send tare").encode(), sender
-            )
+            answer = tare() if valid else "unknown request: send tare"
+            self._socket.sendto(answer.encode(), sender)
         except OSError:  # no request, or the sender is gone
             pass
 
@@ -77,15 +76,11 @@ def compensate_stream(
         return min(left, _STALE_WRENCH_PERIOD_S) if left > 0.0 else _STALE_WRENCH_PERIOD_S
 
     with suppress(KeyboardInterrupt), raise_interrupt_on_sigint():
-        while (
-            not INTERRUPTED_EVENT.is_set()
-            and (readings := source.read(longest_read_timeout_s())) is not None
-        ):
-            if (
-                source.live
-                and (stale := compensator.stale_output(time.monotonic()))
-                and not readings
-            ):
+        while not INTERRUPTED_EVENT.is_set():
+            if (readings := source.read(longest_read_timeout_s())) is None:
+                break
+            stale = compensator.stale_output(time.monotonic()) if source.live else None
+            if stale and not readings:
                 write(stale)
             for reading in readings:
                 out = compensator.step(reading, time.monotonic() if source.live else reading.t)
@@ -131,9 +126,11 @@ def run_compensate_command(
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
 
     def make_compensator(load: Identification) -> Compensator:
+        dt = readings.dt
+        detector = None if free is None else StreamContactDetector(load, free, dt, cutoff_hz)
         return Compensator(
             load,
-            readings.dt,
+            dt,
             sigma=sigma,
             gamma=gamma,
             sigma_weight=sigma_weight,
@@ -142,10 +139,8 @@ def run_compensate_command(
             wait=getattr(readings, "wait", 0),
             predicted=predicted,
             largest=None if largest is None else np.repeat(largest, 3),
-            watch=ContactAndLoadMonitor(load, readings.dt, cutoff_hz) if watch else None,
-            detector=None
-            if free is None
-            else StreamContactDetector(load, free, readings.dt, cutoff_hz),
+            watch=ContactAndLoadMonitor(load, dt, cutoff_hz) if watch else None,
+            detector=detector,
         )
 
     compensator = make_compensator(found) if attach is None else attach(make_compensator)

@@ -12,7 +12,7 @@ TARE_IN_MOTION, TARE_WRENCH_VARIES, TARE_EXCEEDS_DRIFT = 1, 2, 3
 """Reasons to refuse a tare: motion, contact, or more than the drift of offsets."""
 MAX_FORCE_OFFSET_DRIFT_N, MAX_TORQUE_OFFSET_DRIFT_NM = 5.0, 0.25
 """Maximum drift of the offsets [N], [N m]."""
-_MAX_REST_SPECIFIC_FORCE_RMS, _MAX_REST_ANGULAR_RATE_RMS = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
+_MAX_REST_SPECIFIC_FORCE_RMS, _MAX_REST_OMEGA_RMS = 0.1, 0.02  # [m/s^2], [rad/s]
 
 
 @njit(cache=True)
@@ -68,6 +68,7 @@ def contact_and_scaled_wrench_into(
 
 @njit(cache=True)
 def set_scale_factors_into(sigma_weight, sigma_inertia, gamma, scales):
+    """Write sigma_inertia twice, gamma and sigma_weight - sigma_inertia to `scales` (4,)."""
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
@@ -88,18 +89,15 @@ def update_tare_offsets(count, mean, squares, noise_limits, offsets):
         if squares[i] > count * (_MAX_REST_SPECIFIC_FORCE_RMS * _MAX_REST_SPECIFIC_FORCE_RMS):
             return TARE_IN_MOTION
     for i in range(9, 12):
-        if squares[i] + count * (mean[i] * mean[i]) > count * (
-            _MAX_REST_ANGULAR_RATE_RMS * _MAX_REST_ANGULAR_RATE_RMS
-        ):
+        square_sum = squares[i] + count * (mean[i] * mean[i])
+        if square_sum > count * (_MAX_REST_OMEGA_RMS * _MAX_REST_OMEGA_RMS):
             return TARE_IN_MOTION
     for i in range(6):
         if squares[15 + i] > count * (noise_limits[i] * noise_limits[i]):
             return TARE_WRENCH_VARIES
     for i in range(3):
-        if (
-            abs(mean[15 + i]) > MAX_FORCE_OFFSET_DRIFT_N
-            or abs(mean[18 + i]) > MAX_TORQUE_OFFSET_DRIFT_NM
-        ):
+        force, torque = abs(mean[15 + i]), abs(mean[18 + i])
+        if force > MAX_FORCE_OFFSET_DRIFT_N or torque > MAX_TORQUE_OFFSET_DRIFT_NM:
             return TARE_EXCEEDS_DRIFT
     for i in range(6):
         offsets[i] += mean[15 + i]

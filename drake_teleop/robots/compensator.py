@@ -136,12 +136,10 @@ class Compensator:
             ahead = self.lag_s if predicted else 0.0
             self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
-        self._largest = np.concatenate(
-            [np.minimum(_MAX_READING_VALUES[:6], 2.0 * self._range), _MAX_READING_VALUES[6:]]
-        )
-        self._noise_limit = np.maximum(
-            _MAX_REST_WRENCH_RMS_OVER_RESIDUAL * load.residual_rms, _MIN_REST_WRENCH_RMS_LIMIT
-        )
+        self._largest = _MAX_READING_VALUES.copy()
+        self._largest[:6] = np.minimum(self._largest[:6], 2.0 * self._range)
+        noise_limit = _MAX_REST_WRENCH_RMS_OVER_RESIDUAL * load.residual_rms
+        self._noise_limit = np.maximum(noise_limit, _MIN_REST_WRENCH_RMS_LIMIT)
         self._memory = np.full((2, 12), np.nan)
         self._delay_line: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
@@ -151,10 +149,9 @@ class Compensator:
         self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_READING_VALUES + 6))
         self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
-        reading_problem(np.zeros(NUM_READING_VALUES), self._largest, self._range)
-        clip_wrenches(
-            self._contact_and_scaled_wrench(np.zeros(NUM_READING_VALUES), np.zeros(3)), self._range
-        )
+        values = np.zeros(NUM_READING_VALUES)
+        reading_problem(values, self._largest, self._range)
+        clip_wrenches(self._contact_and_scaled_wrench(values, _ZERO_GRAVITY), self._range)
         self._tare_problem_step_and_offsets()
         self._reset_filters()
         self.good_readings_in_row = 0
@@ -209,9 +206,7 @@ class Compensator:
 
     def stale_output(self, now: float) -> CompensatedWrench | None:
         """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
-        if now - self._now <= STALE_AGE_S:
-            return None
-        return self._zero_output(_STALE_FLAG)
+        return self._zero_output(_STALE_FLAG) if now - self._now > STALE_AGE_S else None
 
     def time_to_stale(self, now: float) -> float:
         return max(0.0, self._now + STALE_AGE_S - now)
@@ -305,16 +300,12 @@ class Compensator:
             gravity = _ZERO_GRAVITY
         out = np.empty(12)
         at = self.good_readings_in_row % len(self._tare_rows)
-        phi, zero, scales = self._phi, self._zero_phi, self._scales
-        filters = self._low_pass, self._memory
-        contact_and_scaled_wrench_into(
-            values, gravity, self.offsets, phi, zero, scales, *filters, self._tare_rows, at, out
-        )
+        load = self.offsets, self._phi, self._zero_phi
+        filters = self._low_pass, self._memory, self._tare_rows
+        contact_and_scaled_wrench_into(values, gravity, *load, self._scales, *filters, at, out)
         self.good_readings_in_row += 1
         return out
 
     def _zero_output(self, flags: int) -> CompensatedWrench:
-        self.good_readings_in_row = 0
-        return CompensatedWrench(
-            max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags)
-        )
+        self.good_readings_in_row, number = 0, max(0, self._number)
+        return CompensatedWrench(number, self._t, np.zeros(6), np.zeros(6), int(flags))

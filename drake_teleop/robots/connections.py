@@ -122,21 +122,18 @@ def _address_scheme(address: str) -> str:
     return address.partition("://")[0] if "://" in address or address == "-" else ""
 
 
-def _require_period_s(rate_hz: float | None, address: str) -> float:
+def _period_s(rate_hz: float | None, address: str) -> float:
     if rate_hz is None:
-        raise DrakeTeleopError(
-            "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
-        )
+        what = "the low-pass needs the rate of the readings"
+        raise DrakeTeleopError(what, where=address, remedy="give --rate HZ")
     return 1.0 / rate_hz
 
 
 def _refuse_motion_options(address: str, *options: Any) -> None:
     if any(option is not None for option in options):
-        raise DrakeTeleopError(
-            "this source already contains the motion of sensor frame S",
-            where=address,
-            remedy="remove --motion, --model and --sensor-pose",
-        )
+        what = "this source already contains the motion of sensor frame S"
+        remedy = "remove --motion, --model and --sensor-pose"
+        raise DrakeTeleopError(what, where=address, remedy=remedy)
 
 
 def _open_streams(
@@ -155,18 +152,14 @@ def _open_streams(
         if motion is not None:
             opened.append(_open_registered_source(motion, 1.0 / opened[0].dt, joints))
             if WRENCH_AND_MOTION in opened[1].streams:
-                raise DrakeTeleopError(
-                    "delivers no motion apart from its wrench",
-                    where=motion,
-                    remedy="give a source such as rtde://HOST",
-                )
+                what = "delivers no motion apart from its wrench"
+                remedy = "give a source such as rtde://HOST"
+                raise DrakeTeleopError(what, where=motion, remedy=remedy)
         if arm is not None:
             if JOINTS not in opened[-1].streams:
-                raise DrakeTeleopError(
-                    "delivers no joint positions for --model",
-                    where=address if motion is None else motion,
-                    remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
-                )
+                what = "delivers no joint positions for --model"
+                remedy = "give a source such as zenoh://HOST/TOPIC?joints=/joint_states"
+                raise DrakeTeleopError(what, where=motion or address, remedy=remedy)
             opened[-1] = PoseSourceFromJoints(opened[-1], arm)
         return WrenchAndMotionStreams(*opened, where=motion or address)
     except BaseException:
@@ -188,29 +181,22 @@ def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 
-def _make_source_or_sink(module: str, class_name: str, *arguments: Any) -> Any:
-    """Return an instance of a class in a module of `robots`, whose libraries are optional."""
+def _make(module: str, class_name: str, *arguments: Any) -> Any:
     return getattr(import_module(f"drake_teleop.robots.{module}"), class_name)(*arguments)
 
 
 SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], Source]] = Registry(
     "source",
     {
-        "udp": lambda address, hz, joints: UdpSource(address, _require_period_s(hz, address)),
-        "-": lambda address, hz, joints: JsonLineSource(
-            sys.stdin.fileno(), _require_period_s(hz, address)
+        "udp": lambda at, hz, joints: UdpSource(at, _period_s(hz, at)),
+        "-": lambda at, hz, joints: JsonLineSource(sys.stdin.fileno(), _period_s(hz, at)),
+        "posed": lambda at, hz, joints: PosedSource(at, _period_s(hz, at)),
+        "rtde": lambda at, hz, joints: _make("rtde", "RtdeSource", at),
+        "netft": lambda at, hz, joints: _make("netft", "NetFtSource", at, hz and 1.0 / hz),
+        "zenoh": lambda at, hz, joints: _make(
+            "ros2_zenoh", "ZenohSource", at, _period_s(hz, at), joints
         ),
-        "posed": lambda address, hz, joints: PosedSource(address, _require_period_s(hz, address)),
-        "rtde": lambda address, hz, joints: _make_source_or_sink("rtde", "RtdeSource", address),
-        "netft": lambda address, hz, joints: _make_source_or_sink(
-            "netft", "NetFtSource", address, None if hz is None else 1.0 / hz
-        ),
-        "zenoh": lambda address, hz, joints: _make_source_or_sink(
-            "ros2_zenoh", "ZenohSource", address, _require_period_s(hz, address), joints
-        ),
-        "ros2": lambda address, hz, joints: _make_source_or_sink(
-            "ros2", "Ros2Source", address, _require_period_s(hz, address), joints
-        ),
+        "ros2": lambda at, hz, joints: _make("ros2", "Ros2Source", at, _period_s(hz, at), joints),
     },
 )
 """Sources by the scheme of their address, called with address, rate [Hz] or None, joint names."""
@@ -219,12 +205,12 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: JsonLineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": lambda address: _make_source_or_sink("ros2_zenoh", "ZenohSink", address),
-        "ros2": lambda address: _make_source_or_sink("ros2", "Ros2Sink", address),
-        "foxglove": lambda address: _make_source_or_sink("foxglove", "FoxgloveSink", address),
+        "zenoh": lambda address: _make("ros2_zenoh", "ZenohSink", address),
+        "ros2": lambda address: _make("ros2", "Ros2Sink", address),
+        "foxglove": lambda address: _make("foxglove", "FoxgloveSink", address),
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": lambda address: _make_source_or_sink("foxglove", "McapSink", Path(address)),
+        ".mcap": lambda address: _make("foxglove", "McapSink", Path(address)),
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""

@@ -18,7 +18,7 @@ from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
-STANDARD_GRAVITY_M_S2 = 9.80665  #: m/s^2
+STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True)
@@ -84,12 +84,10 @@ def export_load(
     R_FS = rotation_matrices(np.radians([angles]), "euler", "xyz")[0]
     phi = transform_phi(found.phi, R_FS, [x, y, z])
     if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
-        raise DrakeTeleopError(
-            f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
-            where="export",
-            remedy="use `identify --method consistent`; a negative mass means"
-            " that the sign of the wrench is wrong",
-        )
+        what = f"the load of {found.mass:.4g} kg is not physically consistent, but {to} requires it"
+        remedy = "use `identify --method consistent`; a negative mass means"
+        remedy += " that the sign of the wrench is wrong"
+        raise DrakeTeleopError(what, where="export", remedy=remedy)
     load = ExportedLoad(*mass_com_inertia(phi), sign * found.offsets)
     warnings = _export_warnings(found, to, format)
     notes = "".join(f"{format.comment} {text}\n" for text in warnings if format.comment)
@@ -97,40 +95,30 @@ def export_load(
 
 
 def unused_sensor_pose_error(to: str) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        f"{to} takes its values in the sensor's frame",
-        where="export",
-        remedy="remove the sensor's pose",
-    )
+    what = f"{to} takes its values in the sensor's frame"
+    return DrakeTeleopError(what, where="export", remedy="remove the sensor's pose")
 
 
 def refuse_removed_weight(found: Identification, to: str) -> None:
     if found.weight_removed:
-        raise DrakeTeleopError(
-            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
-            " once more",
-            where="export",
-            remedy="use a wrench without the robot's payload compensation, or `compensate`",
-        )
+        what = "the robot has removed the load's weight from the wrench, and"
+        what += f" {to} would subtract it once more"
+        remedy = "use a wrench without the robot's payload compensation, or `compensate`"
+        raise DrakeTeleopError(what, where="export", remedy=remedy)
 
 
 def _export_warnings(found: Identification, to: str, format: Format) -> list[str]:
-    written = {name: name.startswith(("m", "I")) for name in PARAMETER_NAMES}
-    written |= {name: format.inertia for name in PARAMETER_NAMES if name.startswith("I")}
-    written |= {
-        name: format.offsets for name in PARAMETER_NAMES if name.endswith(("_ox", "_oy", "_oz"))
-    }
+    written = [format.offsets] * 6 + [True] * 4 + [format.inertia] * 6
     warnings = [
         f"{name} is not identified ({verdict}): do not use values that depend on it"
-        for name, verdict in zip(PARAMETER_NAMES, found.verdicts, strict=True)
-        if written[name] and verdict != "identified"
+        for name, verdict, is_written in zip(PARAMETER_NAMES, found.verdicts, written, strict=True)
+        if is_written and verdict != "identified"
     ]
     if not format.inertia:
         warnings.append(f"{to} has no field for the inertia: inertial wrenches remain")
     if not found.physically_consistent:
-        warnings.append(
-            "the load is not physically consistent; `identify --method consistent` corrects it"
-        )
+        remedy = "`identify --method consistent` corrects it"
+        warnings.append(f"the load is not physically consistent; {remedy}")
     return [*warnings, format.note] if format.note else warnings
 
 
@@ -192,12 +180,13 @@ def _admittance_yaml(load: ExportedLoad) -> str:
 
 
 def _bota_json(load: ExportedLoad) -> str:
-    six = dict(zip(("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"), load.inertia_entries, strict=True))
+    names = (name.capitalize() for name in _INERTIA_NAMES)
+    inertia = {name: float(x) for name, x in zip(names, load.inertia_entries, strict=True)}
     bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
     properties = {
         "mass": load.mass,
         "com": dict(zip("xyz", load.com.tolist(), strict=True)),
-        "inertia": {name: float(value) for name, value in six.items()},
+        "inertia": inertia,
         "bias": bias,
     }
     config = {"enable_dynamic_compensation": True, "payload_properties": properties}
@@ -212,12 +201,9 @@ def _urdf_xml(load: ExportedLoad) -> str:
     inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
     SubElement(inertial, "origin", xyz=_space_separated(load.com), rpy="0 0 0")
     SubElement(inertial, "mass", value=_format_number(load.mass))
-    SubElement(
-        inertial,
-        "inertia",
-        dict(zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)),
-    )
-    return _indented_xml(root)
+    inertia = zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)
+    SubElement(inertial, "inertia", dict(inertia))
+    return indented_xml(root)
 
 
 def _sdf_xml(load: ExportedLoad) -> str:
@@ -229,22 +215,20 @@ def _sdf_xml(load: ExportedLoad) -> str:
     inertia = SubElement(inertial, "inertia")
     for name, value in zip(_INERTIA_NAMES, load.inertia_entries, strict=True):
         SubElement(inertia, name).text = _format_number(value)
-    return _indented_xml(root)
+    return indented_xml(root)
 
 
 def _mjcf_xml(load: ExportedLoad) -> str:
     root = Element("mujoco", model="load")
     body = SubElement(SubElement(root, "worldbody"), "body", name="load")
     SubElement(body, "freejoint")
-    inertia = {
-        "mass": _format_number(load.mass),
-        "fullinertia": _space_separated(load.inertia_entries),
-    }
-    SubElement(body, "inertial", {"pos": _space_separated(load.com)} | inertia)
-    return _indented_xml(root)
+    inertial = SubElement(body, "inertial", pos=_space_separated(load.com))
+    inertial.set("mass", _format_number(load.mass))
+    inertial.set("fullinertia", _space_separated(load.inertia_entries))
+    return indented_xml(root)
 
 
-def _indented_xml(root: Element) -> str:
+def indented_xml(root: Element) -> str:
     indent(root)
     return tostring(root, encoding="unicode") + "\n"
 

@@ -55,12 +55,12 @@ class FoxgloveSink:
         self._channel = _WrenchChannel(address)
         import foxglove
 
+        options: dict[str, Any] = {"name": "drake_teleop", "context": self._channel.context}
         try:
-            self._server = foxglove.start_server(
-                name="drake_teleop", host=host, port=port, context=self._channel.context
-            )
+            self._server = foxglove.start_server(host=host, port=port, **options)
         except (OSError, RuntimeError) as error:
-            raise DrakeTeleopError(str(error), where=address) from error
+            remedy = "give a free port, and a host of this machine"
+            raise DrakeTeleopError(str(error), where=address, remedy=remedy) from error
         self.port = self._server.port
 
     def write(self, out: CompensatedWrench) -> None:
@@ -79,10 +79,9 @@ class McapSink:
         import foxglove
 
         make_folder(path.parent)
+        context = self._channel.context
         with wrap_write_errors(path):
-            self._file = foxglove.open_mcap(
-                path, allow_overwrite=True, context=self._channel.context
-            )
+            self._file = foxglove.open_mcap(path, allow_overwrite=True, context=context)
 
     def write(self, out: CompensatedWrench) -> None:
         self._channel.log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))

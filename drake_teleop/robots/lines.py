@@ -34,8 +34,7 @@ from drake_teleop.robots.streams import (
     Source,
 )
 
-_MAX_LINE_BYTES = 4096  # bytes per line
-_READ_BLOCK_BYTES = 65536
+_MAX_LINE_BYTES, _READ_BLOCK_BYTES = 4096, 65536
 
 
 def reading_of_json_line(line: bytes, number: int) -> Reading:
@@ -55,14 +54,9 @@ def reading_of_json_line(line: bytes, number: int) -> Reading:
 
 
 def wrench_json_line(out: CompensatedWrench) -> str:
-    data: dict[str, Any] = {
-        "number": out.number,
-        "t": out.t,
-        "contact": out.contact.tolist(),
-        "scaled": out.scaled.tolist(),
-        "flags": flag_names(out.flags),
-    }
-    return json.dumps(data)
+    data: dict[str, Any] = {"number": out.number, "t": out.t}
+    data |= {"contact": out.contact.tolist(), "scaled": out.scaled.tolist()}
+    return json.dumps(data | {"flags": flag_names(out.flags)})
 
 
 def flag_names(flags: int) -> list[str]:

@@ -26,7 +26,7 @@ START_COMMAND, STOP_COMMAND = 2, 0
 _REQUEST_HEADER = 0x1234
 _SATURATED_STATUS_BIT, _ERROR_STATUS_BIT = 1 << 17, 1 << 31  # bits of the status
 _STREAM_REQUEST_PERIOD_S, _MAX_UNCHANGED_WRENCH_S = 0.1, 0.05
-_MAX_RECORDS_PER_CALL = 256  # records per call
+_MAX_RECORDS_PER_CALL = 256
 _SETTINGS_PAGE_TIMEOUT_S, _MAX_SETTINGS_PAGE_BYTES = 2.0, 1 << 20
 _SI_VALUE_OF_SENSOR_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
@@ -44,8 +44,7 @@ class NetFtSource(Source):
             rate = [1.0 / dt]
         if counts is None or rate is None:
             page = _read_counts_and_rate(parsed)
-            counts = counts or page[:2]
-            rate = rate or page[2:]
+            counts, rate = counts or page[:2], rate or page[2:]
         self.dt = 1.0 / rate[0]
         self._per_count = sign / np.repeat(counts, 3)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -53,7 +52,7 @@ class NetFtSource(Source):
             self._socket.connect((parsed.host, parsed.port))
         except OSError as error:
             self._socket.close()
-            raise DrakeTeleopError(str(error), where=address) from error
+            raise DrakeTeleopError(str(error), where=address, remedy="check the host") from error
         self._pace, self._number = SampleClock(self.dt), 0
         self._last_received = self._last_request = -math.inf
         self._measured, self._measured_at = -1, -math.inf
@@ -109,18 +108,15 @@ class NetFtSource(Source):
 def _read_counts_and_rate(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
-    remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
-    where = f"http://{address.host}/netftapi2.xml"
     connection = HTTPConnection(address.host, timeout=_SETTINGS_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
         return parse_counts_and_rate(connection.getresponse().read(_MAX_SETTINGS_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
-        raise DrakeTeleopError(
-            f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
-            where=where,
-            remedy=remedy,
-        ) from error
+        what = f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})"
+        remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
+        where = f"http://{address.host}/netftapi2.xml"
+        raise DrakeTeleopError(what, where=where, remedy=remedy) from error
     finally:
         connection.close()
 
@@ -130,11 +126,9 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
-    counts = [
-        float(text[f"cfgcp{kind}"])
-        / _SI_VALUE_OF_SENSOR_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
-        for kind in ("f", "t")
-    ]
+    units = (text[f"scfg{kind}u"].replace("-", " ") for kind in "ft")
+    per_unit = (float(text[f"cfgcp{kind}"]) for kind in "ft")
+    counts = [x / _SI_VALUE_OF_SENSOR_UNIT[u] for x, u in zip(per_unit, units, strict=True)]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
         raise ValueError("not positive numbers")

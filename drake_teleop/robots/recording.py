@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ _LOG_COLUMNS_OF_STREAM: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 _GRAVITY_M_S2 = 9.81  # as in `compensate`
-_QUATERNION_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
+_QUATERNION_NORM_TOLERANCE = 0.01
 _NEW_CLOCK_CONFIRMATION_SAMPLES = 50  # successive samples that confirm another clock
 
 
@@ -74,7 +75,7 @@ class Recorder:
     ) -> None:
         self._streams, self._two_clocks = streams, two_clocks
         self._largest = np.full(6, np.inf) if largest is None else largest
-        self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
+        self._R_SF = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0].T
         self._p_FS = X_FS[4:]
         self.log_file_name = "log.parquet"
         self.file_names: tuple[str, ...] = ("log.parquet",)
@@ -89,7 +90,6 @@ class Recorder:
         return {stream: _SampleSeries() for stream in self._streams}
 
     def add(self, reading: Reading) -> None:
-        """Add a reading if it is valid."""
         stream, t, values = reading.stream, reading.t, reading.values
         if stream not in self._part:
             return
@@ -132,9 +132,7 @@ class Recorder:
         start = part[WRENCH].times_and_values(6, self.left_out)[0][0]
         for stream, samples in part.items():
             shift = samples.min_offset - part[WRENCH].min_offset if self._two_clocks else 0.0
-            names = [
-                name for columns in _LOG_COLUMNS_OF_STREAM[stream].values() for name in columns
-            ]
+            names = list(chain(*_LOG_COLUMNS_OF_STREAM[stream].values()))
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + (shift - start)} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
@@ -143,16 +141,13 @@ class Recorder:
     def _log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY_M_S2}
         for stream in self._streams:
-            fields = {
-                name: {"columns": list(names)}
-                for name, names in _LOG_COLUMNS_OF_STREAM[stream].items()
-            }
-            found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
+            found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}}
+            for name, columns in _LOG_COLUMNS_OF_STREAM[stream].items():
+                found[stream][name] = {"columns": list(columns)}
         if POSE in found:
-            R_SF = self._R_FS.T
             found[POSE]["orientation"]["form"] = "quaternion_wxyz"
-            found[POSE]["position_in_sensor"] = (-R_SF @ self._p_FS).tolist()
-            found[POSE]["rotation_in_sensor"] = R_SF.tolist()
+            found[POSE]["position_in_sensor"] = (-self._R_SF @ self._p_FS).tolist()
+            found[POSE]["rotation_in_sensor"] = self._R_SF.tolist()
         return found
 
 
@@ -175,11 +170,9 @@ class _SampleSeries:
 
     def times_and_values(self, width: int, left_out: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
-            raise DrakeTeleopError(
-                f"{len(self.t)} valid and {left_out} invalid readings received (minimum: 2 valid)",
-                where="calibrate",
-                remedy="check that the source sends to this port",
-            )
+            counts = f"{len(self.t)} valid and {left_out} invalid readings"
+            what, remedy = f"{counts} received (minimum: 2 valid)", "check the source's address"
+            raise DrakeTeleopError(what, where="calibrate", remedy=remedy)
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 

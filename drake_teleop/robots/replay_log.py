@@ -36,17 +36,13 @@ class ReplayLogSource(Source):
     ) -> None:
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
-            raise DrakeTeleopError(
-                "is a log of static poses, which have no order in time",
-                where=str(path),
-                remedy="give a log of a motion",
-            )
+            what = "is a log of static poses, which have no order in time"
+            raise DrakeTeleopError(what, where=str(path), remedy="give a log of a motion")
         delay_s = 0.0
         if load is not None:
             log = replace_specific_force_by_acceleration(log) if load.weight_removed else log
-            delay_s, source = choose_delay(
-                log, cutoff_hz, delay, phi_with_inertia_replaced(load)[0]
-            )
+            phi = phi_with_inertia_replaced(load)[0]
+            delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
             if source == "undetermined":
                 delay_s = load.delay_s
             log = remove_delay(log, delay_s)

@@ -33,8 +33,8 @@ from drake_teleop.robots.streams import (
 )
 
 _NODE_NAME = "drake_teleop"
-_MAX_DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
-_MAX_QUEUED_MESSAGES = 256  # queued messages of a stream
+_MAX_DIAGNOSTICS_PERIOD_S = 1.0
+_MAX_QUEUED_MESSAGES = 256  # of each stream
 _MAX_SERVICE_SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
 
 
@@ -85,11 +85,9 @@ def message_class(kind: str, where: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError:
-        raise DrakeTeleopError(
-            f"needs the ROS package {package}, which is not installed",
-            where=where,
-            remedy="install it with ROS 2 and source its setup file, or use pose= or joints=",
-        ) from None
+        what = f"needs the ROS package {package}, which is not installed"
+        remedy = "install it with ROS 2 and source its setup file, or use pose= or joints="
+        raise DrakeTeleopError(what, where=where, remedy=remedy) from None
 
 
 class Ros2Source(Source):
@@ -162,10 +160,9 @@ class Ros2Source(Source):
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        best_effort = QoSProfile(
-            depth=_MAX_QUEUED_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT
-        )
-        options = {"callback": receive, "qos_profile": best_effort, "raw": True}
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        newest = QoSProfile(depth=_MAX_QUEUED_MESSAGES, reliability=best_effort)
+        options = {"callback": receive, "qos_profile": newest, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 
 
@@ -179,32 +176,27 @@ class Ros2Sink:
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
         self._which = parsed.parameter_among_words("wrench", ("contact", "scaled"))
-        kinds = [WRENCH_STAMPED]
-        kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
-        kinds += ["diagnostic_msgs/msg/KeyValue"]
-        classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in kinds}
+        names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
+        types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
+        classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}
         self._kinds = SimpleNamespace(**classes)
         self._message = self._kinds.WrenchStamped()
         self._message.header.frame_id = parsed.optional_parameter("frame") or ""
         self._node = shared_node(domain)
         self._topic, self._flags, self._next = f"/{topic}", -1, 0.0
         self._counts: Counter[str] = Counter()
-        node = self._node.node
-        self._wrenches = node.create_publisher(
-            self._kinds.WrenchStamped, self._topic, qos_profile_sensor_data
-        )
-        self._diagnostics = node.create_publisher(self._kinds.DiagnosticArray, "/diagnostics", 100)
+        node, kinds = self._node.node, self._kinds
+        quality = qos_profile_sensor_data
+        self._wrenches = node.create_publisher(kinds.WrenchStamped, self._topic, quality)
+        self._diagnostics = node.create_publisher(kinds.DiagnosticArray, "/diagnostics", 100)
 
     @delayed_signals()
     def write(self, out: CompensatedWrench) -> None:
         message, ns = self._message, time.time_ns()
         _set_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
-        for vector, values in (
-            (message.wrench.force, wrench[:3]),
-            (message.wrench.torque, wrench[3:]),
-        ):
-            vector.x, vector.y, vector.z = values
+        force, torque = message.wrench.force, message.wrench.torque
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
         self._wrenches.publish(message)
         self._counts.update(flag_names(out.flags) if out.flags else ())
         now = time.monotonic()

@@ -21,7 +21,7 @@ MESSAGE_TYPE_OF_TOPIC = {
     JOINTS: "sensor_msgs/msg/JointState",
 }
 _STREAM_OF_TOPIC = {"tf": POSE}
-_MAX_TRANSFORM_CHAIN_FRAMES = 64  # frames in a chain
+_MAX_TRANSFORM_CHAIN_FRAMES = 64
 SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
@@ -29,22 +29,17 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 def domain_of_address(address: Address) -> int:
     text = address.optional_parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
-        raise DrakeTeleopError(
-            f"domain={text!r} is not a ROS domain",
-            where=address.text,
-            remedy="give a whole number from 0 to 232",
-        )
+        what, remedy = f"domain={text!r} is not a ROS domain", "give a whole number from 0 to 232"
+        raise DrakeTeleopError(what, where=address.text, remedy=remedy)
     return int(text)
 
 
 def checked_topic_name(address: Address, name: str) -> str:
     topic = name.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
-        raise DrakeTeleopError(
-            f"{name!r} is not the name of a ROS topic",
-            where=address.text,
-            remedy="give one such as /ft_sensor/wrench",
-        )
+        what = f"{name!r} is not the name of a ROS topic"
+        remedy = "give one such as /ft_sensor/wrench"
+        raise DrakeTeleopError(what, where=address.text, remedy=remedy)
     return topic
 
 
@@ -60,17 +55,11 @@ def topics_frames_and_streams(
     if (text := address.optional_parameter("tf")) is not None:
         frames, topics["tf"] = tuple(text.split(",")), "tf"
         if len(frames) != 2 or not all(frames):
-            raise DrakeTeleopError(
-                f"tf={text!r} does not name two frames",
-                where=address.text,
-                remedy="give tf=PARENT,CHILD",
-            )
+            what = f"tf={text!r} does not name two frames"
+            raise DrakeTeleopError(what, where=address.text, remedy="give tf=PARENT,CHILD")
     if JOINTS in topics and not joints:
-        raise DrakeTeleopError(
-            "joint positions need the model of the arm",
-            where=address.text,
-            remedy="give --model and --sensor-frame",
-        )
+        what = "joint positions need the model of the arm"
+        raise DrakeTeleopError(what, where=address.text, remedy="give --model and --sensor-frame")
     return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
 
 
@@ -103,18 +92,12 @@ class MessageConverter:
     def add_transforms(self, data: Any) -> None:
         """Store the transforms of a TFMessage; those of `/tf_static` yield no pose."""
         for each in data.transforms:
-            X = each.transform
-            self._links[each.child_frame_id] = (
-                each.header.frame_id,
-                _pose_array(X.translation, X.rotation),
-            )
+            link = _pose_array(each.transform.translation, each.transform.rotation)
+            self._links[each.child_frame_id] = each.header.frame_id, link
 
     def _message_values(self, name: str, data: Any) -> Array | None:
         if name == WRENCH:
-            wrench = data.wrench
-            return self._sign * np.array(
-                [*_vector_array(wrench.force), *_vector_array(wrench.torque)]
-            )
+            return self._sign * _six_numbers(data.wrench.force, data.wrench.torque)
         if name == POSE:
             return _pose_array(data.pose.position, data.pose.orientation)
         if name == JOINTS:
@@ -122,9 +105,7 @@ class MessageConverter:
             if not self._joints or not all(joint in positions for joint in self._joints):
                 return None
             return np.array([positions[joint] for joint in self._joints], float)
-        return np.array(
-            [*_vector_array(data.linear_acceleration), *_vector_array(data.angular_velocity)]
-        )
+        return _six_numbers(data.linear_acceleration, data.angular_velocity)
 
     def _pose_from_transforms(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
@@ -145,8 +126,8 @@ class MessageConverter:
         return []
 
 
-def _vector_array(v: Any) -> tuple[float, float, float]:
-    return v.x, v.y, v.z
+def _six_numbers(v: Any, w: Any) -> Array:
+    return np.array([v.x, v.y, v.z, w.x, w.y, w.z])
 
 
 def _pose_array(p: Any, q: Any) -> Array:

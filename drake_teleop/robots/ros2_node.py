@@ -55,13 +55,12 @@ class ServedCompensator:
         node.declare_parameter("seconds", 120.0)
         node.add_on_set_parameters_callback(self._check_scale_parameters)
         node.add_post_set_parameters_callback(lambda _: self._apply_scale_parameters())
-        node.create_service(
-            Trigger, "~/tare", self._make_service_callback(lambda: self._current.tare())
-        )
-        node.create_service(
-            Trigger, "~/load", self._make_service_callback(self._reload_compensator)
-        )
-        node.create_service(Trigger, "~/calibrate", self._answer_calibration_request)
+        for service, answer in (
+            ("~/tare", self._make_service_callback(lambda: self._current.tare())),
+            ("~/load", self._make_service_callback(self._reload_compensator)),
+            ("~/calibrate", self._answer_calibration_request),
+        ):
+            node.create_service(Trigger, service, answer)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._current, name)
@@ -87,10 +86,10 @@ class ServedCompensator:
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
-            separate = each.name in _SCALE_NAMES[2:]
-            if each.name in _SCALE_NAMES and not (
-                math.isfinite(each.value) and (separate or each.value >= 0.0)
-            ):
+            if each.name not in _SCALE_NAMES:
+                continue
+            lowest = -math.inf if each.name in _SCALE_NAMES[2:] else 0.0
+            if not (math.isfinite(each.value) and each.value >= lowest):
                 reason = f"{each.name}: {each.value} is not a finite number of at least 0"
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
@@ -158,9 +157,8 @@ def run_ros2_command(
     """Run the command `ros2` until SIGINT or SIGTERM."""
     for address in (source, sink):
         if not address.startswith("ros2://"):
-            raise DrakeTeleopError(
-                "is not an address of a ROS topic", where=address, remedy="give ros2://TOPIC"
-            )
+            what = "is not an address of a ROS topic"
+            raise DrakeTeleopError(what, where=address, remedy="give ros2://TOPIC")
     node = shared_node(domain_of_address(parse_ros2_address(source, SOURCE_PARAMETERS)))
     scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALE_NAMES}
     served: list[ServedCompensator] = []

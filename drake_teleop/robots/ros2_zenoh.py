@@ -30,7 +30,7 @@ DEFAULT_ROUTER_PORT = 7447
 _NUMBER_AND_TIME_FORMAT = struct.Struct("<qq")
 _ATTACHMENT_FORMAT = struct.Struct("<qqB16s")
 _OLD_ATTACHMENT_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
-_MAX_QUEUED_MESSAGES = 4096  # queued messages; newer ones are dropped
+_MAX_QUEUED_MESSAGES = 4096  # newer ones are dropped
 _NODE_NAME = "drake_teleop"
 
 
@@ -63,15 +63,13 @@ def open_session(address: Address) -> Any:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise DrakeTeleopError(
-            f"no zenoh router answers on port {address.port}",
-            where=address.text,
-            remedy="check the host, and start the router: ros2 run rmw_zenoh_cpp rmw_zenohd",
-        ) from error
+        what = f"no zenoh router answers on port {address.port}"
+        remedy = "check the host, and start the router: ros2 run rmw_zenoh_cpp rmw_zenohd"
+        raise DrakeTeleopError(what, where=address.text, remedy=remedy) from error
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Return the zenoh key of a topic, by default with any type hash."""
+    """Return the zenoh key of a topic; `hashed` is the type hash (default: any)."""
     return f"{domain}/{topic}/{_dds_type_name(kind)}/{hashed}"
 
 
@@ -95,11 +93,9 @@ def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
 def number_in_attachment(attached: bytes) -> int | None:
     if len(attached) == _ATTACHMENT_FORMAT.size:
         return int(_NUMBER_AND_TIME_FORMAT.unpack_from(attached)[0])
-    if (
-        attached.startswith(_OLD_ATTACHMENT_PREFIX)
-        and len(attached) >= len(_OLD_ATTACHMENT_PREFIX) + 8
-    ):
-        return int(struct.unpack_from("<q", attached, len(_OLD_ATTACHMENT_PREFIX))[0])
+    number = attached.removeprefix(_OLD_ATTACHMENT_PREFIX)[:8]
+    if attached.startswith(_OLD_ATTACHMENT_PREFIX) and len(number) == 8:
+        return int.from_bytes(number, "little", signed=True)
     return None
 
 
@@ -150,9 +146,8 @@ class ZenohSource(Source):
         self._queue: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
         self._session = open_session(parsed)
         for stream, topic in topics.items():
-            self._session.declare_subscriber(
-                topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream]), self._make_callback(stream)
-            )
+            key = topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream])
+            self._session.declare_subscriber(key, self._make_callback(stream))
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         found: list[Reading] = []
@@ -198,9 +193,8 @@ class ZenohSink:
             self._session.liveliness().declare_token(token)
             for token in liveliness_tokens(domain, zid, _NODE_NAME, topic, WRENCH_STAMPED, hashed)
         ]
-        self._publisher = self._session.declare_publisher(
-            topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True
-        )
+        key = topic_key(domain, topic, WRENCH_STAMPED, hashed)
+        self._publisher = self._session.declare_publisher(key, express=True)
 
     def write(self, out: CompensatedWrench) -> None:
         ns = time.time_ns()

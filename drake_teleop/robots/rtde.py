@@ -20,8 +20,7 @@ from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Reading, Sou
 RTDE_PORT = 30004
 _FIRST_SAMPLES_TIMEOUT_S = 10.0  # wait for the robot at the start
 _MIN_READER_RESTART_PERIOD_S = 0.2  # between two starts of the child
-_RATE_MEASUREMENT_SAMPLES = 5  # samples for the rate
-_READ_BLOCK_BYTES = 65536
+_RATE_MEASUREMENT_SAMPLES, _READ_BLOCK_BYTES = 5, 65536
 
 
 class RtdeSource(Source):
@@ -32,9 +31,8 @@ class RtdeSource(Source):
     def __init__(self, address: str) -> None:
         parsed = Address(address, RTDE_PORT, allowed=("sign",))
         if parsed.port != RTDE_PORT:
-            raise DrakeTeleopError(
-                "RTDE always uses port 30004", where=address, remedy="remove the port"
-            )
+            what = "RTDE always uses port 30004"
+            raise DrakeTeleopError(what, where=address, remedy="remove the port")
         require_library("rtde_receive", "ur_rtde", "robots", address)
         self._host, self._sign = parsed.host, parsed.wrench_sign()
         self._partial, self._started = b"", 0.0
@@ -42,18 +40,12 @@ class RtdeSource(Source):
         quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
         deadline = time.monotonic() + _FIRST_SAMPLES_TIMEOUT_S
-        while (
-            len(self._first) < _RATE_MEASUREMENT_SAMPLES
-            and (left := deadline - time.monotonic()) > 0.0
-        ):
+        while len(self._first) < _RATE_MEASUREMENT_SAMPLES:
+            if (left := deadline - time.monotonic()) <= 0.0:
+                self.close()
+                what, remedy = "no robot answers on port 30004", "check the host, and enable RTDE"
+                raise DrakeTeleopError(what, where=address, remedy=remedy)
             self._first += self._read_samples(left)
-        if len(self._first) < _RATE_MEASUREMENT_SAMPLES:
-            self.close()
-            raise DrakeTeleopError(
-                "no robot answers on port 30004",
-                where=address,
-                remedy="check the host, and that RTDE is enabled",
-            )
         spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
         self.dt = 0.002 if spacing < 0.005 else 0.008
 

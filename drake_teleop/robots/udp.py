@@ -29,8 +29,8 @@ POSED_FORMAT = struct.Struct("<4sIQd13d")
 WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _PACKET_HEADER = struct.Struct("<4sIQd")
-_MAX_PACKETS_PER_CALL = 256  # packets per call
-_SOCKET_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
+_MAX_PACKETS_PER_CALL = 256
+_SOCKET_BUFFER_BYTES = 1 << 20  # a tenth of a second at 8 kHz
 _SATURATED_FLAG = int(ReadingFlag.SATURATED)
 
 
@@ -69,11 +69,9 @@ def pack_wrench(out: CompensatedWrench) -> bytes:
 
 def unpack_wrench(packet: bytes) -> CompensatedWrench:
     if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
-        raise DrakeTeleopError(
-            f"its {len(packet)} bytes are not a compensated wrench",
-            where="packet",
-            remedy=f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}",
-        )
+        what = f"its {len(packet)} bytes are not a compensated wrench"
+        remedy = f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}"
+        raise DrakeTeleopError(what, where="packet", remedy=remedy)
     _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)
     return CompensatedWrench(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
@@ -85,11 +83,8 @@ def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
     except ValueError:
         host, port = "", None
     if port is None:
-        raise DrakeTeleopError(
-            "has no port from 0 to 65535",
-            where=address,
-            remedy="give one, such as udp://127.0.0.1:49152",
-        )
+        remedy = "give one, such as udp://127.0.0.1:49152"
+        raise DrakeTeleopError("has no port from 0 to 65535", where=address, remedy=remedy)
     return host, port
 
 
@@ -99,11 +94,8 @@ def open_udp_receiver(host: str, port: int) -> socket.socket:
         receiver.bind((host, port))
     except OSError as error:
         receiver.close()
-        raise DrakeTeleopError(
-            str(error),
-            where=f"udp://{host}:{port}",
-            remedy="give a free port, and as host nothing or an address of this machine",
-        ) from error
+        remedy = "give a free port, and as host nothing or an address of this machine"
+        raise DrakeTeleopError(str(error), where=f"udp://{host}:{port}", remedy=remedy) from error
     return receiver
 
 
@@ -166,11 +158,8 @@ class UdpSink:
             self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:
             if isinstance(error, socket.gaierror):
-                raise DrakeTeleopError(
-                    "is not a known host",
-                    where=self._to[0],
-                    remedy="check the name, or give an IP address",
-                ) from error
+                what, remedy = "is not a known host", "check the name, or give an IP address"
+                raise DrakeTeleopError(what, where=self._to[0], remedy=remedy) from error
 
     def close(self) -> None:
         self._socket.close()

@@ -11,6 +11,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.detection import (
+    MIN_NOISE_FLOOR_SAMPLES,
     NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
     ContactDetector,
     fit_noise_floor,
@@ -37,21 +38,17 @@ LOAD_WRENCH_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
 MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_MASS_STD_RATIO_TO_REPLACE_LOAD = (
-    1e-12  # accuracy at which another load would replace the present one
-)
+# Accuracy at which another load would replace the present one.
+_MASS_STD_RATIO_TO_REPLACE_LOAD = 1e-12
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def white_wrench_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
-    share = (
-        1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH_OVER_CUTOFF * cutoff_hz * dt)
-    )
-    return np.maximum(
-        load.residual_rms / math.sqrt(share), MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt)
-    )
+    """Return the white noise (6,) of a reading, rms [N, N m], from the filtered residual."""
+    bandwidth_hz = _NOISE_BANDWIDTH_OVER_CUTOFF * (math.inf if cutoff_hz is None else cutoff_hz)
+    noise = load.residual_rms / math.sqrt(min(1.0, 2.0 * bandwidth_hz * dt))
+    return np.maximum(noise, MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt))
 
 
 class ContactAndLoadMonitor:
@@ -110,39 +107,33 @@ class StreamContactDetector:
             raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _FREE_LOG_RATE_TOLERANCE:
-            raise DrakeTeleopError(
-                f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz",
-                where=str(free),
-                remedy="use the log that `calibrate` wrote from this stream",
-            )
-        self._fast, self._slow = (
-            low_pass_and_settled_state(dt, hz) for hz in (cutoff_hz, _GRAVITY_CUTOFF_HZ)
-        )
+            what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"
+            remedy = "use the log that `calibrate` wrote from this stream"
+            raise DrakeTeleopError(what, where=str(free), remedy=remedy)
+        self._fast = low_pass_and_settled_state(dt, cutoff_hz)
+        self._slow = low_pass_and_settled_state(dt, _GRAVITY_CUTOFF_HZ)
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
-        phi, (s, omega, alpha) = (
-            phi_with_inertia_replaced(load)[0],
-            np.split(values[:, 6:], 3, axis=1),
-        )
-        contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
+        transient = round(0.5 / (_GRAVITY_CUTOFF_HZ * dt))  # of the low-passes
+        if len(values) < (required := transient + MIN_NOISE_FLOOR_SAMPLES):
+            what = f"has {len(values)} valid readings, too few for a noise floor"
+            remedy = f"give a log of free motion with at least {required}"
+            raise DrakeTeleopError(what, where=str(free), remedy=remedy)
+        phi = phi_with_inertia_replaced(load)[0]
+        contact = values[:, :6] - non_contact_wrench(*np.split(values[:, 6:], 3, axis=1), phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
         slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
-        rows = np.hstack([fast, fast[:, 6:9] - slow_s])
-        # Skip the transient of the low-passes.
-        settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
+        settled = np.hstack([fast, fast[:, 6:9] - slow_s])[transient:]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
         covariance = limit_covariance_to_scales(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
         threshold = max(NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(_CONTACT_STATISTIC))
+        following = dt / MEAN_WRENCH_TIME_CONSTANT_S
         self._settings = ContactDetector(
-            floor,
-            threshold,
-            statistic=_CONTACT_STATISTIC,
-            hold=hold,
-            following=dt / MEAN_WRENCH_TIME_CONSTANT_S,
+            floor, threshold, statistic=_CONTACT_STATISTIC, hold=hold, following=following
         ).settings
         self.restart()
         self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
@@ -154,9 +145,8 @@ class StreamContactDetector:
 
     def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
-        touched = _filter_and_detect_contact(
-            self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
-        )
+        settings = self._fast, self._slow, self._filters, self._settings
+        touched = _filter_and_detect_contact(self._memory, values, contact, *settings)
         return int(ReadingFlag.IN_CONTACT) if touched else 0
 
 

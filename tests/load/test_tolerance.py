@@ -38,6 +38,11 @@ def test_invalid_tolerance_is_refused(text: str) -> None:
         parse_tolerance(text)
 
 
+def test_number_that_is_not_numeric_is_no_tolerance() -> None:
+    with pytest.raises(DrakeTeleopError, match=r"'mass 1\.1\.1 %' is no tolerance"):
+        parse_tolerance("mass 1.1.1 %")
+
+
 def test_derivatives_equal_finite_differences() -> None:
     tolerance, step = parse_tolerance(ALL), 1e-6
     steps = step * np.eye(10)

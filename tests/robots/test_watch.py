@@ -134,6 +134,14 @@ def test_noise_floor_requires_the_same_rate_and_a_low_pass(tmp_path: Path) -> No
         StreamContactDetector(LOAD, tmp_path / "free.parquet", DT, None)
 
 
+def test_short_free_log_is_named_with_the_required_number_of_readings(tmp_path: Path) -> None:
+    (t, values), free = readings(), tmp_path / "free.parquet"
+    write_log(Log(t[:540], *np.split(values[:540], [6, 9, 12], axis=1)), free)
+    message = r"free\.parquet: has 540 valid readings, .* free motion with at least 600"
+    with pytest.raises(DrakeTeleopError, match=message):
+        StreamContactDetector(LOAD, free, DT, 30.0, 0.0)
+
+
 def test_another_load_is_flagged_after_a_motion() -> None:
     t, values = readings()
     more = phi_from_mass_com_inertia(0.5, [0.0, 0.03, 0.1], 1e-4 * np.eye(3))

@@ -24,8 +24,8 @@ _MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 def consistent_least_squares(gram: Array, right: Array, theta: Array) -> Array:
     """Return [offsets; phi] (16,) of the rigid body that fits best.
 
-    `theta` (16,) solves the weighted normal equations `gram` and `right` without constraint; it is
-    returned if `gram` cannot separate load and offsets.
+    `theta` (16,) solves the normal equations `gram` and `right` without constraint; it is returned
+    if they cannot separate load and offsets.
     """
     if is_physically_consistent(theta[6:]):
         return theta

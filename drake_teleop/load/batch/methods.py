@@ -78,9 +78,8 @@ def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorF
 
 
 def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
-    return _fit_moments_and_wrench_noise(
-        record.moments, replace(options, noise=NoiseStd(options.noise.wrench)), record
-    )
+    exact_motion = replace(options, noise=NoiseStd(options.noise.wrench))
+    return _fit_moments_and_wrench_noise(record.moments, exact_motion, record)
 
 
 def _fit_total_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
@@ -107,10 +106,8 @@ def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
-        rejected = (
-            _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
-            > _REJECTION_STDS
-        )
+        distances = _largest_residuals_over_robust_std(record, form.theta, options.shared_noise)
+        rejected = distances > _REJECTION_STDS
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
         if _std_growth_by_rejection(whole, moments) > _MAX_FIT_STD_GROWTH:
@@ -202,19 +199,17 @@ def identify_batch(
     record = SampleRecord(*rows)
     options = EstimatorOptions(noise or NoiseStd(), offsets, shared_noise)
     fit = METHODS[method].fit(record, options)
-    equations = SecondMoments(
-        np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
-    )
+    steps_at_rest = resolution if shared_noise else None
+    equations = SecondMoments(np.diag(fit.form.weights) ** -0.5, resolution=steps_at_rest)
     kept = ~fit.rejected
     equations.add_samples(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean_products
     walk = np.square(np.broadcast_to(options.noise.walk, 12))
     steps = residual_covariance(np.diag(np.pad(walk, (1, 6))), theta)
-    white = covariance_for_white_noise(plain.covariance, equations, fit)
-    covariance = covariance_of_solution(
-        white + covariance_for_random_walks(record, kept, fit, steps), fit.form, offsets
-    )
+    covariance = covariance_for_white_noise(plain.covariance, equations, fit)
+    covariance = covariance + covariance_for_random_walks(record, kept, fit, steps)
+    covariance = covariance_of_solution(covariance, fit.form, offsets)
     if gain_std > 0.0:
         known = np.isfinite(np.diag(covariance))
         gain_covariance = gain_std**2 * covariance_for_gain_errors(fit, offsets)
@@ -247,12 +242,10 @@ def _fit_moments_and_wrench_noise(
             motion = moments.mean_noise_covariance_of_z(noise, np.zeros(6))
             explained = np.diag(residual_covariance(motion, theta))
             if options.shared_noise:
-                squares, explained = (
-                    x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
-                )
-            std = np.sqrt(
-                np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares).clip(floor**2)
-            )
+                squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
+                explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
+            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL * squares)
+            std = np.sqrt(variances.clip(floor**2))
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 

@@ -84,9 +84,8 @@ def _solve_compensated_equations(
     # In these coordinates G is the identity; nu is the noise share of each direction.
     nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
-    scale = _min_singular_noise_scale(
-        basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7])
-    )
+    squares, noise = (float(np.sum(W * moments[1:7, 1:7])) for moments in (Z, Q))
+    scale = _min_singular_noise_scale(basis.T @ right, nu, squares, noise)
     gain = 1.0 - scale * nu
     kept = gain > (min_gain if nu[-1] > 0.0 else 0.0)
     inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T

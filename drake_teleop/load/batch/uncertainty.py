@@ -103,15 +103,13 @@ class BaseParameters:
         if self.parameters_without_influence:
             names = ", ".join(self.parameters_without_influence)
             lines.append(f"without influence on this record: {names}")
-        lines += [
-            f"only together: {c}" for c in self.combinations if np.count_nonzero(c.coefficients) > 1
-        ]
+        several = (c for c in self.combinations if np.count_nonzero(c.coefficients) > 1)
+        lines += [f"only together: {c}" for c in several]
         for c in self.weak_directions:
             if np.count_nonzero(c.coefficients) == 1 or c.relative_std > MAX_IDENTIFIED_STD_SHARE:
-                percentage = (
-                    f"{100.0 * c.relative_std:.0f} % of" if c.relative_std < 1.0 else "more than"
-                )
-                lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
+                percent = 100.0 * c.relative_std
+                share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
+                lines.append(f"weak: {c} ({share} the natural scale of the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
         if self.channels_with_slow_noise:
@@ -128,12 +126,10 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
 
     def scaled_combination(coefficients: Array, leading: int) -> ParameterCombination:
         c = coefficients / coefficients[leading]
-        deviation = float(np.sqrt(max(0.0, c @ covariance @ c)))
-        size = float(np.linalg.norm(c * natural))
+        std = float(np.sqrt(max(0.0, c @ covariance @ c)))
+        relative_std = std / float(np.linalg.norm(c * natural))
         words = _combination_text(c, leading, np.abs(c) * natural)
-        return ParameterCombination(
-            c, leading, float(c @ theta), deviation, deviation / size, words
-        )
+        return ParameterCombination(c, leading, float(c @ theta), std, relative_std, words)
 
     # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
     # the load as independent, so that the text begins with its parameters.
@@ -184,9 +180,9 @@ GAIN_ERROR_TORQUE_ARM_M = 0.06
 def covariance_for_white_noise(
     least_squares_covariance: Array, equations: SecondMoments, fit: EstimatorFit
 ) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] by noise with the channel correlation of W.
+    """Return the covariance (16, 16) by noise whose channels correlate as in the fit's weights.
 
-    W are the weights of `fit`; if they are diagonal, `least_squares_covariance` is returned.
+    Without correlation it is `least_squares_covariance`.
     """
     W, Z = fit.form.weights, fit.moments.mean_products
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -248,10 +244,9 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
     Z, W = fit.moments.mean_products, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
-    products = (regressor_coefficients() @ Z)[:, :, 1:7]
-    effects = fit.form.map_from_ordinary @ parameter_errors_by_gains(
-        products[None], W[None], root @ root.T
-    )
+    products = (regressor_coefficients() @ Z)[None, :, :, 1:7]
+    errors = parameter_errors_by_gains(products, W[None], root @ root.T)
+    effects = fit.form.map_from_ordinary @ errors
     return np.asarray(effects @ effects.T)
 
 

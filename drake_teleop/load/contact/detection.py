@@ -134,9 +134,8 @@ def _normalized_sum_of_last_innovations(memory, hold, widths):
     while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
     # Sum before that window; zero if there was no sample yet.
-    before = RING_BUFFER_START + 6 * (
-        (int(memory[SAMPLE_COUNT_INDEX]) + MAX_SUMMED_SAMPLES - 1 - (1 << m)) % MAX_SUMMED_SAMPLES
-    )
+    last = int(memory[SAMPLE_COUNT_INDEX]) - 1
+    before = RING_BUFFER_START + 6 * ((last + MAX_SUMMED_SAMPLES - (1 << m)) % MAX_SUMMED_SAMPLES)
     total = 0.0
     for i in range(6):
         difference = memory[INNOVATION_SUM_START + i] - memory[before + i]
@@ -165,9 +164,8 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
 def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, decision):
     """Process one sample with `ContactDetector.settings`; return whether there is contact."""
     slack, following, statistic, enter, leave, hold = decision
-    update_statistics(
-        memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
-    )
+    sample = contact, s, omega, alpha, acceleration
+    update_statistics(memory, *sample, parameters, slack, following, leave)
     return update_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
 
 
@@ -227,7 +225,10 @@ class ContactDetector:
 
 
 def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S."""
+    """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S.
+
+    NaN for a zero force.
+    """
     w = finite_array("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
     square = np.sum(f * f, axis=-1)
@@ -236,6 +237,7 @@ def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
     return direction, np.cross(f, tau) / square[..., None], np.sum(f * tau, axis=-1) / square
 
 
+MIN_NOISE_FLOOR_SAMPLES = 100
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
 _MIN_WRENCH_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
 _MAX_VARIANCE_FITS, _VARIANCE_FIT_TOLERANCE = 20, 1e-4
@@ -252,12 +254,13 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
+    """Return the noise floor of `DetectorSamples` in free motion."""
     from scipy.optimize import nnls
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
-    if len(rows[0]) < 100:
+    if len(rows[0]) < MIN_NOISE_FLOOR_SAMPLES:
         what = f"{len(rows[0])} samples are too few for a noise floor"
-        remedy = "give 100 samples of free motion or more"
+        remedy = f"give {MIN_NOISE_FLOOR_SAMPLES} samples of free motion or more"
         raise DrakeTeleopError(what, where="contact", remedy=remedy)
     P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
@@ -280,9 +283,8 @@ def fit_noise_floor(
             variance = terms @ fitted[c] + explained
             if np.allclose(fitted[c], previous, rtol=_VARIANCE_FIT_TOLERANCE, atol=0.0):
                 break
-    floor = NoiseFloor(
-        np.sqrt(fitted[:, 0]), P, np.sqrt(fitted[:, 1:]), np.eye(6), np.zeros(6), fade=fade
-    )
+    noise, per_acceleration = np.sqrt(fitted[:, 0]), np.sqrt(fitted[:, 1:])
+    floor = NoiseFloor(noise, P, per_acceleration, np.eye(6), np.zeros(6), fade=fade)
     scaled = rows[0] / floor.noise_std_along(*rows[1:])
     deviations = np.sqrt(np.mean(scaled**2, axis=0))
     scales = np.maximum(deviations, 1e-6)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
+from drake_teleop.common.vectors import dot
 from drake_teleop.load.identification import natural_scales
 from drake_teleop.load.regressor import regressor_into
 
@@ -105,9 +106,8 @@ class NoiseFloor:
 
     def threshold(self, statistic: str, margin: float = THRESHOLD_OVER_MAX) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
-        return margin * float(
-            positive_array("free_maxima", self.free_maxima, 3)[statistic_index(statistic)]
-        )
+        maxima = positive_array("free_maxima", self.free_maxima, 3)
+        return margin * float(maxima[statistic_index(statistic)])
 
     @property
     def compiled_parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
@@ -125,16 +125,10 @@ class NoiseFloor:
 
 
 @njit(cache=True)
-def _squared_norm(x):
-    return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
-
-
-@njit(cache=True)
 def hold_acceleration_peaks(memory, acceleration, alpha, fade):
-    memory[HELD_ACCELERATION_INDEX] = max(
-        _squared_norm(acceleration), fade * memory[HELD_ACCELERATION_INDEX]
-    )
-    memory[HELD_ALPHA_INDEX] = max(_squared_norm(alpha), fade * memory[HELD_ALPHA_INDEX])
+    held = memory[HELD_ACCELERATION_INDEX : HELD_ALPHA_INDEX + 1]
+    held[0] = max(dot(acceleration, acceleration), fade * held[0])
+    held[1] = max(dot(alpha, alpha), fade * held[1])
 
 
 @njit(cache=True)

@@ -143,16 +143,14 @@ def _update_filter(memory, filter_start, block, noise):
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
     V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
     before = memory[filter_start : filter_start + 272].copy()
-    chi = update_estimate_by_block_mean(
-        before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block)
-    )
+    root = whitening_matrix(motion, phi, noise, noise[15], block)
+    chi = update_estimate_by_block_mean(before, V, wrench, root)
     if noise[15] == 0.0:
         copy_into(memory, filter_start, before, 0, 272)
     else:
-        long_term_root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
-        update_estimate_by_block_mean(
-            memory[filter_start : filter_start + 272], V, wrench, long_term_root
-        )
+        root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
+        estimate = memory[filter_start : filter_start + 272]
+        update_estimate_by_block_mean(estimate, V, wrench, root)
     return chi
 
 
@@ -283,7 +281,7 @@ def change_detector_parameters(
     relative_wrench_error: float = 0.0,
     mass_std_ratio: float | None = None,
 ) -> DetectorParameters:
-    """Return the parameters of the change detector.
+    """Return block [samples], noise variances (17,), window and hold [blocks], mass_std_ratio.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].

@@ -167,16 +167,13 @@ class RecursiveEstimator(ABC):
         parts = (wrench, s, omega, alpha)
         shapes = [np.shape(part) for part in parts]
         if shapes != [(6,), (3,), (3,), (3,)]:
-            names = "wrench, s, omega, alpha"
+            what = f"wrench, s, omega, alpha of one sample have shapes {shapes}"
             remedy = "pass shapes (6,), (3,), (3,), (3,)"
-            raise DrakeTeleopError(
-                f"{names} of one sample have shapes {shapes}", where="sample", remedy=remedy
-            )
+            raise DrakeTeleopError(what, where="sample", remedy=remedy)
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
-            raise DrakeTeleopError(
-                "contains NaN or infinity", where="sample", remedy="leave the sample out"
-            )
+            what, remedy = "contains NaN or infinity", "leave the sample out"
+            raise DrakeTeleopError(what, where="sample", remedy=remedy)
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
@@ -192,9 +189,8 @@ class RecursiveEstimator(ABC):
 
     def identification(self) -> Identification:
         if self._theta[6] == 0.0:
-            raise DrakeTeleopError(
-                "has not received a sample", where="estimator", remedy="call update first"
-            )
+            what = "has not received a sample"
+            raise DrakeTeleopError(what, where="estimator", remedy="call update first")
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         return Identification(
@@ -211,10 +207,9 @@ class RecursiveEstimator(ABC):
         )
 
     def _are_certain(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
-        certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
-        return certain & is_precise_enough(
-            deviations * (MAX_IDENTIFIED_STD_SHARE / max_std), theta[6:]
-        )
+        scaled = deviations * (MAX_IDENTIFIED_STD_SHARE / max_std)
+        from_data = ~is_prior_dominated(deviations, np.sqrt(self._prior))
+        return from_data & is_precise_enough(scaled, theta[6:])
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)

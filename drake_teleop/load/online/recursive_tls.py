@@ -51,15 +51,8 @@ def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
 
 @njit(cache=True)
 def allocate_scratch():
-    return (
-        np.empty((13, 6, 16)),
-        np.empty(16),
-        np.empty((6, 19)),
-        np.empty((6, 19)),
-        np.empty((6, 12)),
-        np.empty((6, 6)),
-        np.empty((6, 6)),
-    )
+    E, g, inverse = np.empty((13, 6, 16)), np.empty(16), np.empty((6, 12))
+    return E, g, np.empty((6, 19)), np.empty((6, 19)), inverse, np.empty((6, 6)), np.empty((6, 6))
 
 
 @njit(cache=True)
@@ -129,9 +122,8 @@ def noise_products(Z, noise_std, motion_std, Q):
         for i in range(3):
             for j in range(3):
                 both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCT_INDICES[i, j]]
-                Q[_OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]] += (
-                    motion_std[3 + k] ** 2 * both
-                )
+                row, column = _OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]
+                Q[row, column] += motion_std[3 + k] ** 2 * both
 
 
 @njit(cache=True)
@@ -353,9 +345,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _MIN_RELATIVE_PIVOT) | (
-            excess > _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
-        )
+        min_excess = _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        excited = (shares < _MIN_RELATIVE_PIVOT) | (excess > min_excess)
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
@@ -366,13 +357,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
-        options = (
-            self._noise_std,
-            self._motion_std,
-            *nonzero_regressor_terms(),
-            allocate_scratch(),
-            Q,
-        )
+        noise, space = (self._noise_std, self._motion_std), allocate_scratch()
+        options = *noise, *nonzero_regressor_terms(), space, Q
         scale = write_rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
 

@@ -24,7 +24,6 @@ from drake_teleop.robots.streams import NUM_READING_VALUES, Reading
 TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 """Options of a C compiler for the bits of Python."""
-KERNEL_FILES = ("wrench_compensator.h", "wrench_compensator.c", "load.h")
 _TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _NUM_TEST_READINGS = 1000
 _TEST_WRENCH_AMPLITUDES = np.repeat([1.0, 0.05], 3)
@@ -37,13 +36,8 @@ def c_kernel_text() -> str:
     c = Translator()
     values, row, out = (NUM_READING_VALUES,), (NUM_READING_VALUES + 6,), (12,)
     c.translate_function(step.reading_problem, values=values, largest=values, limits=(6,))
-    c.translate_function(
-        step.set_scale_factors_into,
-        sigma_weight="double",
-        sigma_inertia="double",
-        gamma="double",
-        scales=(4,),
-    )
+    factors = dict.fromkeys(("sigma_weight", "sigma_inertia", "gamma"), "double")
+    c.translate_function(step.set_scale_factors_into, **factors, scales=(4,))
     c.translate_function(
         step.contact_and_scaled_wrench_into,
         values=values,
@@ -59,18 +53,11 @@ def c_kernel_text() -> str:
         out=out,
     )
     c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
-    c.translate_function(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
-    c.translate_function(
-        step.update_tare_offsets,
-        count="double",
-        mean=row,
-        squares=row,
-        noise_limits=(6,),
-        offsets=(6,),
-    )
-    c.translate_function(
-        design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,)
-    )
+    moments: dict[str, Any] = {"count": "double", "mean": row, "squares": row}
+    c.translate_function(step.add_to_statistics, row=row, **moments)
+    c.translate_function(step.update_tare_offsets, **moments, noise_limits=(6,), offsets=(6,))
+    numbers = dict.fromkeys(("dt", "tangent", "ahead_s"), "double")
+    c.translate_function(design_low_pass, **numbers, low_pass=(7,))
     return render_template("wrench_compensator.c", kernel=c.text, helpers=C_HELPER_FUNCTIONS)
 
 
@@ -119,16 +106,12 @@ def c99_files(target: ControllerTarget) -> Files:
 
 
 def kernel_files(target: ControllerTarget) -> Files:
-    load = render_template(
-        "load.h", dt=repr(target.dt), settings=target.settings_initializer(), notes=target.notes
-    )
-    return dict(
-        zip(
-            KERNEL_FILES,
-            (read_template("wrench_compensator.h"), c_kernel_text(), load),
-            strict=True,
-        )
-    )
+    settings, dt = target.settings_initializer(), repr(target.dt)
+    return {
+        "wrench_compensator.h": read_template("wrench_compensator.h"),
+        "wrench_compensator.c": c_kernel_text(),
+        "load.h": render_template("load.h", dt=dt, settings=settings, notes=target.notes),
+    }
 
 
 def read_template(name: str) -> str:
@@ -139,15 +122,12 @@ def render_template(name: str, **values: Any) -> str:
     """Return a shipped template with inserted values; nothing is escaped."""
 
     def keep_unescaped(value: Any) -> Any:
-        if isinstance(value, str):
-            return Markup(value)
-        return (
-            [keep_unescaped(each) for each in value] if isinstance(value, (list, tuple)) else value
-        )
+        if isinstance(value, (list, tuple)):
+            return [keep_unescaped(each) for each in value]
+        return Markup(value) if isinstance(value, str) else value
 
-    values = {
-        key: keep_unescaped(value) for key, value in ({"version": __version__} | values).items()
-    }
+    values = {key: keep_unescaped(value) for key, value in values.items()}
+    values.setdefault("version", __version__)
     return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
@@ -168,7 +148,6 @@ def _test_vector_header(target: ControllerTarget) -> str:
 
 
 def _simulated_readings_and_sensor_range(target: ControllerTarget) -> tuple[Array, Array]:
-    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) and a sensor range (6,)."""
     phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])

@@ -38,13 +38,11 @@ def ros2_filter_files(target: ControllerTarget) -> Files:
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
+    folder = _FILTER_TEMPLATE_FOLDER
     return {
-        **{
-            name: read_template(f"{_FILTER_TEMPLATE_FOLDER}/{file}")
-            for name, file in shipped.items()
-        },
+        **{name: read_template(f"{folder}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": render_template(f"{_FILTER_TEMPLATE_FOLDER}/README.md", **values),
+        "README.md": render_template(f"{folder}/README.md", **values),
     }
 
 
@@ -72,9 +70,8 @@ def export_controller(
     `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
     if rate_hz is None:
-        raise DrakeTeleopError(
-            f"missing, but required by {to}", where="rate", remedy="give the readings' rate in Hz"
-        )
+        what, remedy = f"missing, but required by {to}", "give the readings' rate in Hz"
+        raise DrakeTeleopError(what, where="rate", remedy=remedy)
     if sensor_pose is not None:
         raise unused_sensor_pose_error(to)
     refuse_removed_weight(found, to)
@@ -82,10 +79,8 @@ def export_controller(
     if largest is None:
         notes.append("no range of the sensor was given: saturation is not detected")
     whole = None if largest is None else np.repeat(np.array(largest, float), 3)
-    files = CONTROLLER_FORMATS[to](
-        ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
-    )
-    for name, content in files.items():
+    target = ControllerTarget(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes)
+    for name, content in CONTROLLER_FORMATS[to](target).items():
         path = out / name
         make_folder(path.parent)
         with replace_file_on_success(path) as temporary:

@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 from uuid import NAMESPACE_URL, uuid5
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.common.version import __version__
 from drake_teleop.robots.controller.c99 import (
@@ -20,8 +20,9 @@ from drake_teleop.robots.controller.c99 import (
     kernel_files,
     read_template,
 )
+from drake_teleop.robots.export import indented_xml
 
-_MODEL_NAME = "wrench_compensator"
+_MODEL_NAME, _XML_HEAD = "wrench_compensator", '<?xml version="1.0" encoding="UTF-8"?>\n'
 _WRENCH_COMPONENT_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 _UNIT_EXPONENTS = {
     "N": {"kg": "1", "m": "1", "s": "-2"},
@@ -66,7 +67,7 @@ def _fmu_archive(
         group = SubElement(configuration, "SourceFileSet", language="C99")
         for name in compiled:
             SubElement(group, "SourceFile", name=name)
-        files["sources/buildDescription.xml"] = _indented_xml(build)
+        files["sources/buildDescription.xml"] = _XML_HEAD + indented_xml(build)
     if cc is not None:
         binary = f"binaries/{_PLATFORM_OF_FMI_VERSION[version]}/{_MODEL_NAME}.so"
         files[binary] = _compile_library(cc, sources, compiled)
@@ -129,9 +130,8 @@ def _model_description(
         time = {"name": "time", "valueReference": str(len(listed)), "causality": "independent"}
         SubElement(variables, "Float64", time | {"variability": "continuous"})
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
-    structure = SubElement(root, "ModelStructure")
-    _add_output_unknowns(structure, outputs, new)
-    return _indented_xml(root)
+    _add_output_unknowns(SubElement(root, "ModelStructure"), outputs, new)
+    return _XML_HEAD + indented_xml(root)
 
 
 def _add_output_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
@@ -164,8 +164,3 @@ def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, floa
         *((name, "parameter", unit, float(value)) for name, unit, value in phi),
         *((f"offset_{name}", "parameter", unit, float(x)) for (name, unit), x in offsets),
     ]
-
-
-def _indented_xml(root: Element) -> str:
-    indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"

@@ -155,9 +155,8 @@ class _FunctionTranslation:
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
             self._translate_assignment(node.targets[0], self._translate_expression(node.value))
         elif isinstance(node, ast.AugAssign):
-            self._translate_assignment(
-                node.target, self._translate_operation(node, node.op, node.target, node.value)
-            )
+            value = self._translate_operation(node, node.op, node.target, node.value)
+            self._translate_assignment(node.target, value)
         elif self._expanding:
             raise self._unsupported_error(node, "only assignments are expanded at a call")
         elif isinstance(node, ast.Return) and node.value is not None:
@@ -178,25 +177,19 @@ class _FunctionTranslation:
             raise self._unsupported_error(node)
 
     def _translate_loop(self, node: ast.For, name: str) -> None:
-        call = node.iter
-        if (
-            not (isinstance(call, ast.Call) and self._translate_expression(call.func) is range)
-            or call.args[2:]
-        ):
+        call, arguments = node.iter, list[ast.expr]()
+        if isinstance(call, ast.Call) and self._translate_expression(call.func) is range:
+            arguments = call.args
+        if len(arguments) not in (1, 2):
             raise self._unsupported_error(call, "a loop needs range(stop) or range(start, stop)")
-        *start, stop = [
-            _c_expression(self._translate_expression(argument)) for argument in call.args
-        ]
-        self._locals[name] = "int"
-        self._values[name] = _CScalar(name, "int")
-        first = start[0] if start else "0"
+        limits = [_c_expression(self._translate_expression(argument)) for argument in arguments]
+        self._locals[name], self._values[name] = "int", _CScalar(name, "int")
+        first, stop = ["0", *limits][-2:]
         self._translate_block(node.body, f"for ({name} = {first}; {name} < {stop}; ++{name})")
 
     def _translate_assignment(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Tuple):
-            value = self._store_in_variables(
-                value
-            )  # all are calculated before the first is written
+            value = self._store_in_variables(value)  # calculated before the first is written
             for each, part in zip(target.elts, value, strict=True):
                 self._translate_assignment(each, part)
         elif isinstance(target, ast.Subscript):
@@ -207,9 +200,8 @@ class _FunctionTranslation:
             self._values[target.id] = self._store_in_variables(value)
         elif isinstance(value, (tuple, _CArray)):
             if self._indent > 1:
-                raise self._unsupported_error(
-                    target, "tuples and arrays cannot be assigned in a branch or loop"
-                )
+                why = "tuples and arrays cannot be assigned in a branch or loop"
+                raise self._unsupported_error(target, why)
             self._values[target.id] = self._store_in_variables(value)
         else:
             if isinstance(self._values.get(target.id), _CScalar) and target.id not in self._locals:
@@ -226,12 +218,10 @@ class _FunctionTranslation:
             return
         k = self._new_local("int")
         source = f"{value.text}[{k}]" if isinstance(value, _CArray) else _c_expression(value)
-        self._write_line(
-            f"for ({k} = 0; {k} < {place.shape[0]}; ++{k}) {place.text}[{k}] = {source};"
-        )
+        head = f"for ({k} = 0; {k} < {place.shape[0]}; ++{k})"
+        self._write_line(f"{head} {place.text}[{k}] = {source};")
 
     def _store_in_variables(self, value: Any) -> Any:
-        """Store the value's expressions in new C variables, which no later write changes."""
         if isinstance(value, tuple):
             return tuple(map(self._store_in_variables, value))
         if not isinstance(value, _CScalar) or value.constant:
