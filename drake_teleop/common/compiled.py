@@ -44,7 +44,9 @@ def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[
         dispatcher = numba.njit(**options | {"cache": False, "no_cfunc_wrapper": True})(function)
         if options.get("cache") and isinstance(dispatcher, Dispatcher):
             with suppress(RuntimeError):  # no writable folder: each process compiles again
-                dispatcher._cache = _DispatcherCache(function, dispatcher)
+                dispatcher._cache = FunctionCache(function)
+                folder = Path(dispatcher._cache.cache_path)
+                dispatcher._cache._cache_file = _CacheFiles(folder, dispatcher)
         return dispatcher
 
     return compile_function
@@ -84,12 +86,6 @@ def address_of_function(function: Dispatcher, arguments: tuple[types.Type, ...])
         raise DrakeTeleopError("is not compiled", where=where, remedy=remedy)
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
-
-
-class _DispatcherCache(FunctionCache):
-    def __init__(self, function: FunctionType, dispatcher: Dispatcher) -> None:
-        super().__init__(function)
-        self._cache_file = _CacheFiles(Path(self.cache_path), dispatcher)
 
 
 class _CacheFiles:

@@ -28,12 +28,9 @@ def render_page(package: str, template: str, **values: Any) -> str:
         owner = "drake_teleop.common" if name == "page.html.j2" else package
         return resources.files(owner).joinpath(name).read_text(encoding="utf-8")
 
+    loader, undefined = jinja2.FunctionLoader(read_template), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(read_template),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, undefined=undefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     return environment.get_template(template).render(**values)
 

@@ -117,14 +117,8 @@ def to_yaml_text(
 
 def format_yaml_value(value: Any, flow: bool | None = True) -> str:
     """Return a value as YAML in one line; with `flow` None, blocks have their own lines."""
-    text: str = yaml.dump(
-        value,
-        Dumper=_YamlDumper,
-        default_flow_style=flow,
-        width=math.inf,
-        allow_unicode=True,
-        sort_keys=False,
-    )
+    options: dict[str, Any] = {"Dumper": _YamlDumper, "allow_unicode": True, "sort_keys": False}
+    text: str = yaml.dump(value, default_flow_style=flow, width=math.inf, **options)
     return text.removesuffix("...\n").strip("\n")
 
 

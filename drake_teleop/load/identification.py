@@ -140,10 +140,9 @@ class Identification:
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
         fields = list(self.__dataclass_fields__)
-        document = {name: getattr(self, name) for name in (*fields[:4], "verdicts")}
-        document |= self._derived_quantities()
-        document |= {name: getattr(self, name) for name in fields[4:]}
-        write_json(Path(path), document)  # infinity becomes null
+        names = *fields[:4], "verdicts", *_DERIVED_FIELDS, *fields[4:]
+        # Infinity becomes null.
+        write_json(Path(path), {name: getattr(self, name) for name in names})
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
@@ -195,7 +194,8 @@ class Identification:
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             others = "phi, covariance, identifiable or prior_dominated"
             raise _file_error(f"contradicts {others}", f"{path}:verdicts")
-        for name, value in result._derived_quantities().items():
+        for name in _DERIVED_FIELDS:
+            value = getattr(result, name)
             if isinstance(value, bool):
                 follows = document[name] is value
             else:
@@ -204,9 +204,6 @@ class Identification:
             if not follows:
                 raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
         return result
-
-    def _derived_quantities(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in _DERIVED_FIELDS}
 
 
 def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:

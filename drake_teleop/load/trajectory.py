@@ -86,10 +86,8 @@ class FourierTrajectory:
                     what = f"there is no field '{unknown[0]}'"
                     names = ", ".join(sorted(known))
                     raise DrakeTeleopError(what, where=where, remedy=f"the fields are {names}")
-            q0, rho, delta = (
-                np.array([joint[name] for joint in joints], dtype=float)
-                for name in ("q0", "rho", "delta")
-            )
+            columns = ([joint[name] for joint in joints] for name in ("q0", "rho", "delta"))
+            q0, rho, delta = (np.array(column, dtype=float) for column in columns)
             frequency = float(data["frequency"])
         except KeyError as error:
             what, remedy = f"{error} is missing", "give q0, rho, delta and frequency"

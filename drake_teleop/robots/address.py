@@ -17,15 +17,14 @@ class Address:
         self.text = text
         try:
             parts = urlsplit(text)
-            parameters = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=False))
+            self._parameters = dict(parse_qsl(parts.query, keep_blank_values=True))
             self.host, self.port = parts.hostname or host, parts.port or port
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:
             raise DrakeTeleopError("has no host", where=text, remedy=f"use {parts.scheme}://HOST")
         self.path = parts.path.strip("/")
-        self._parameters = parameters
-        if unknown := parameters.keys() - set(allowed):
+        if unknown := self._parameters.keys() - set(allowed):
             what = f"unknown parameter {min(unknown)!r}"
             raise DrakeTeleopError(what, where=text, remedy=f"use {', '.join(allowed)}")
 

@@ -19,22 +19,7 @@ from drake_teleop.logs.processing import (
     phi_with_inertia_replaced,
     weight_scale_without_effect_error,
 )
-from drake_teleop.robots.compensation_step import (
-    MAX_FORCE_OFFSET_DRIFT_N,
-    MAX_TORQUE_OFFSET_DRIFT_NM,
-    TARE_EXCEEDS_DRIFT,
-    TARE_IN_MOTION,
-    TARE_WRENCH_VARIES,
-    VALUE_AT_RANGE,
-    VALUE_NOT_FINITE,
-    VALUE_TOO_LARGE,
-    add_to_statistics,
-    clip_wrenches,
-    contact_and_scaled_wrench_into,
-    reading_problem,
-    set_scale_factors_into,
-    update_tare_offsets,
-)
+from drake_teleop.robots import compensation_step as kernel
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
     NUM_READING_VALUES,
@@ -54,7 +39,8 @@ RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
 TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
-MAX_SENSOR_OFFSET_DRIFT = np.repeat([MAX_FORCE_OFFSET_DRIFT_N, MAX_TORQUE_OFFSET_DRIFT_NM], 3)
+_MAX_DRIFTS = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
+MAX_SENSOR_OFFSET_DRIFT = np.repeat(_MAX_DRIFTS, 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_CHECK_READINGS, _RATE_CHECK_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_STAMP_S = 1e12  # [s]
@@ -69,9 +55,9 @@ _GAP_FLAG = int(ReadingFlag.GAP)
 _WRONG_RATE_FLAG = int(ReadingFlag.WRONG_RATE)
 _IN_CONTACT_FLAG = int(ReadingFlag.IN_CONTACT)
 _FLAG_OF_PROBLEM = {
-    VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,
-    VALUE_TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
-    VALUE_AT_RANGE: ReadingFlag.SATURATED,
+    kernel.VALUE_NOT_FINITE: ReadingFlag.NOT_FINITE,
+    kernel.VALUE_TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
+    kernel.VALUE_AT_RANGE: ReadingFlag.SATURATED,
 }
 # Maximum rms of the wrench at rest, as a multiple of the residual of the identification, and at
 # least [N, N m].
@@ -150,8 +136,8 @@ class Compensator:
         self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
         values = np.zeros(NUM_READING_VALUES)
-        reading_problem(values, self._largest, self._range)
-        clip_wrenches(self._contact_and_scaled_wrench(values, _ZERO_GRAVITY), self._range)
+        kernel.reading_problem(values, self._largest, self._range)
+        kernel.clip_wrenches(self._contact_and_scaled_wrench(values, _ZERO_GRAVITY), self._range)
         self._tare_problem_step_and_offsets()
         self._reset_filters()
         self.good_readings_in_row = 0
@@ -180,7 +166,7 @@ class Compensator:
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
             raise weight_scale_without_effect_error("load")
-        set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
+        kernel.set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> CompensatedWrench:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
@@ -200,7 +186,7 @@ class Compensator:
             flags &= ~_IN_CONTACT_FLAG
             flags |= self._detector.contact_flag(reading.values, self._delay_line[-1][:6])
         wrench = self._delay_line[0].copy()
-        if clip_wrenches(wrench, self._range):
+        if kernel.clip_wrenches(wrench, self._range):
             flags |= _CLIPPED_FLAG
         return CompensatedWrench(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
@@ -216,11 +202,11 @@ class Compensator:
         if self.good_readings_in_row < len(self._tare_rows):
             return f"refused: fewer than {TARE_REST_S:g} s of good readings so far"
         problem, step, offsets = self._tare_problem_step_and_offsets()
-        if problem == TARE_IN_MOTION:
+        if problem == kernel.TARE_IN_MOTION:
             return "refused: the sensor moves"
-        if problem == TARE_WRENCH_VARIES:
+        if problem == kernel.TARE_WRENCH_VARIES:
             return "refused: the wrench varies, as in contact"
-        if problem == TARE_EXCEEDS_DRIFT:
+        if problem == kernel.TARE_EXCEEDS_DRIFT:
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
                 f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
@@ -237,23 +223,23 @@ class Compensator:
     def _tare_problem_step_and_offsets(self) -> tuple[int, Array, Array]:
         (mean, squares), offsets = np.zeros((2, NUM_READING_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
-            add_to_statistics(row, float(number), mean, squares)
+            kernel.add_to_statistics(row, float(number), mean, squares)
         count = float(len(self._tare_rows))
-        problem = update_tare_offsets(count, mean, squares, self._noise_limit, offsets)
+        problem = kernel.update_tare_offsets(count, mean, squares, self._noise_limit, offsets)
         return problem, mean[NUM_READING_VALUES:], offsets
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags
         if flags & _DAMAGED_FLAG:
             return _DAMAGED_FLAG
-        problem = reading_problem(reading.values, self._largest, self._range)
+        problem = kernel.reading_problem(reading.values, self._largest, self._range)
         if not math.isfinite(reading.t):
-            problem = VALUE_NOT_FINITE
-        elif abs(reading.t) > _MAX_TIME_STAMP_S and problem != VALUE_NOT_FINITE:
-            problem = VALUE_TOO_LARGE
+            problem = kernel.VALUE_NOT_FINITE
+        elif abs(reading.t) > _MAX_TIME_STAMP_S and problem != kernel.VALUE_NOT_FINITE:
+            problem = kernel.VALUE_TOO_LARGE
         if problem:
             flags |= int(_FLAG_OF_PROBLEM[problem])
-        if problem in (VALUE_NOT_FINITE, VALUE_TOO_LARGE):
+        if problem in (kernel.VALUE_NOT_FINITE, kernel.VALUE_TOO_LARGE):
             return flags
         ahead = now - reading.t
         started = not math.isinf(self._min_offset)
@@ -300,9 +286,9 @@ class Compensator:
             gravity = _ZERO_GRAVITY
         out = np.empty(12)
         at = self.good_readings_in_row % len(self._tare_rows)
-        load = self.offsets, self._phi, self._zero_phi
+        load = self.offsets, self._phi, self._zero_phi, self._scales
         filters = self._low_pass, self._memory, self._tare_rows
-        contact_and_scaled_wrench_into(values, gravity, *load, self._scales, *filters, at, out)
+        kernel.contact_and_scaled_wrench_into(values, gravity, *load, *filters, at, out)
         self.good_readings_in_row += 1
         return out
 

@@ -77,11 +77,9 @@ class Recorder:
         self._largest = np.full(6, np.inf) if largest is None else largest
         self._R_SF = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0].T
         self._p_FS = X_FS[4:]
-        self.log_file_name = "log.parquet"
-        self.file_names: tuple[str, ...] = ("log.parquet",)
-        if WRENCH_AND_MOTION not in streams:
-            self.log_file_name = "log.yaml"
-            self.file_names = "log.yaml", *(f"{each}.parquet" for each in _LOG_COLUMNS_OF_STREAM)
+        tables = [] if WRENCH_AND_MOTION in streams else list(_LOG_COLUMNS_OF_STREAM)
+        self.log_file_name = "log.yaml" if tables else "log.parquet"
+        self.file_names = self.log_file_name, *(f"{each}.parquet" for each in tables)
         self.left_out, self.clock_changes = 0, 0
         self._part, self._other_clock = self._make_empty_part(), self._make_empty_part()
         self._longest = self._part

@@ -136,7 +136,10 @@ class Ros2Source(Source):
                         break
                     receive(*taken)
 
-    def _make_receiver(self, name: str, kind: Any) -> Callable[[bytes, Any], None]:
+    def _subscribe_and_get_receiver(
+        self, name: str, kind: Any, topic: str
+    ) -> tuple[Any, Callable[..., None]]:
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
         from rclpy.serialization import deserialize_message
 
         def receive(message: bytes, info: Any) -> None:
@@ -149,14 +152,7 @@ class Ros2Source(Source):
                 return
             self._found += self._converter.readings_of_message(name, data, number)
 
-        return receive
-
-    def _subscribe_and_get_receiver(
-        self, name: str, kind: Any, topic: str
-    ) -> tuple[Any, Callable[..., None]]:
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
-        node, receive = self._node.node, self._make_receiver(name, kind)
+        node = self._node.node
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)

@@ -6,7 +6,7 @@ import json
 import queue
 import struct
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -147,7 +147,7 @@ class ZenohSource(Source):
         self._session = open_session(parsed)
         for stream, topic in topics.items():
             key = topic_key(domain, topic, MESSAGE_TYPE_OF_TOPIC[stream])
-            self._session.declare_subscriber(key, self._make_callback(stream))
+            self._session.declare_subscriber(key, partial(self._enqueue, stream))
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         found: list[Reading] = []
@@ -162,14 +162,11 @@ class ZenohSource(Source):
     def close(self) -> None:
         self._session.close()
 
-    def _make_callback(self, stream: str) -> Callable[[Any], None]:
-        def enqueue(sample: Any) -> None:
-            if self._queue.qsize() < _MAX_QUEUED_MESSAGES:
-                attachment = sample.attachment
-                attachment = b"" if attachment is None else attachment.to_bytes()
-                self._queue.put((stream, sample.payload.to_bytes(), attachment))
-
-        return enqueue
+    def _enqueue(self, stream: str, sample: Any) -> None:
+        if self._queue.qsize() < _MAX_QUEUED_MESSAGES:
+            attachment = sample.attachment
+            attachment = b"" if attachment is None else attachment.to_bytes()
+            self._queue.put((stream, sample.payload.to_bytes(), attachment))
 
 
 class ZenohSink:

@@ -120,7 +120,8 @@ class StreamContactDetector:
             remedy = f"give a log of free motion with at least {required}"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)
         phi = phi_with_inertia_replaced(load)[0]
-        contact = values[:, :6] - non_contact_wrench(*np.split(values[:, 6:], 3, axis=1), phi)
+        s, omega, alpha = np.split(values[:, 6:], 3, axis=1)
+        contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         fast = causal_low_pass(np.hstack([contact, values[:, 6:]]), dt, cutoff_hz)
         slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)

@@ -94,12 +94,8 @@ class BaseParameters:
     weak_directions: tuple[ParameterCombination, ...]
     channels_with_slow_noise: tuple[str, ...]
 
-    @property
-    def num_combinations(self) -> int:
-        return len(self.combinations)
-
     def text_lines(self) -> list[str]:
-        lines = [f"{self.num_combinations} of 16 combinations of offsets and load are determined"]
+        lines = [f"{len(self.combinations)} of 16 combinations of offsets and load are determined"]
         if self.parameters_without_influence:
             names = ", ".join(self.parameters_without_influence)
             lines.append(f"without influence on this record: {names}")

@@ -19,23 +19,21 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array
 from drake_teleop.load.contact.noise_floor import (
-    HELD_ACCELERATION_INDEX,
-    HELD_ALPHA_INDEX,
     MAX_SUMMED_SAMPLES,
     NUM_SUM_LENGTHS,
     DetectorSamples,
     NoiseFloor,
-    hold_acceleration_peaks,
     noise_std_into,
+    noise_variances_into,
     statistic_index,
     validate_detector_samples,
-    wrench_variance_by_parameters_into,
 )
 
-# Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
+# Indices into the memory: sample count; held |a|^2 and |alpha|^2; contact flag; samples
 # below CONTACT_END_LEVEL; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6);
 # sum of all e (6); ring of its last MAX_SUMMED_SAMPLES values.
-SAMPLE_COUNT_INDEX, FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 0, 3, 4, 5
+SAMPLE_COUNT_INDEX, HELD_SQUARES_START = 0, 1
+FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 3, 4, 5
 NORMALIZED_WRENCH_START, MEAN_START, CUSUM_START = 8, 14, 20
 INNOVATION_SUM_START, RING_BUFFER_START = 26, 32
 MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
@@ -59,13 +57,10 @@ def update_statistics(
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
-    hold_acceleration_peaks(memory, acceleration, alpha, fade)
-    wrench_variance_by_parameters_into(s, omega, alpha, P, V, scaled)
+    noise, held = (variances, P, growth, fade), memory[HELD_SQUARES_START:FLAG_INDEX]
+    noise_variances_into(held, s, omega, alpha, acceleration, *noise, V, scaled)
     for c in range(6):
-        moving = growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
-        moving += growth[c, 1] * memory[HELD_ALPHA_INDEX]
-        variance = variances[c] + max(scaled[c], 0.0) + moving
-        scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(variance)
+        scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(scaled[c])
     count = int(memory[SAMPLE_COUNT_INDEX])
     level, length = 0.0, 0.0
     for i in range(6):

@@ -7,7 +7,6 @@ n is the noise at rest, P the covariance of [offsets; phi]; a and alpha are acce
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -25,9 +24,6 @@ MAX_SUMMED_SAMPLES = 128
 """Longest window of the likelihood ratio [samples], a power of two."""
 NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
 """Number of windows: 1, 2, 4 ... MAX_SUMMED_SAMPLES samples."""
-
-# Indices of held squares in the memory of a detector.
-HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = 1, 2
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
@@ -125,15 +121,13 @@ class NoiseFloor:
 
 
 @njit(cache=True)
-def hold_acceleration_peaks(memory, acceleration, alpha, fade):
-    held = memory[HELD_ACCELERATION_INDEX : HELD_ALPHA_INDEX + 1]
+def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
+    """Write the variances (6,) of a sample's contact wrench into `out`; update `held` (2,).
+
+    `held` are the held squares of acceleration and alpha, `V` (6, 10) is scratch memory.
+    """
     held[0] = max(dot(acceleration, acceleration), fade * held[0])
     held[1] = max(dot(alpha, alpha), fade * held[1])
-
-
-@njit(cache=True)
-def wrench_variance_by_parameters_into(s, omega, alpha, P, V, out):
-    """Write the wrench variances (6,) due to uncertain [offsets; phi] into `out`."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -144,20 +138,17 @@ def wrench_variance_by_parameters_into(s, omega, alpha, P, V, out):
             for j in range(10):
                 row += V[c, j] * P[6 + i, 6 + j]
             value += V[c, i] * row
-        out[c] = value
+        moving = growth[c, 0] * held[0] + growth[c, 1] * held[1]
+        out[c] = variances[c] + max(value, 0.0) + moving
 
 
 @njit(cache=True)
 def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
     """Write the noise sigma (N, 6) of a record's contact wrench into `out`."""
-    memory, V = np.zeros(3), np.empty((6, 10))
+    held, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, growth, fade)
     for k in range(s.shape[0]):
-        hold_acceleration_peaks(memory, acceleration[k], alpha[k], fade)
-        wrench_variance_by_parameters_into(s[k], omega[k], alpha[k], P, V, out[k])
-        for c in range(6):
-            moving = growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
-            moving += growth[c, 1] * memory[HELD_ALPHA_INDEX]
-            out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
+        noise_variances_into(held, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])
+        out[k] = np.sqrt(out[k])
 
 
 def validate_detector_samples(*arrays: ArrayLike) -> list[Array]:

@@ -373,15 +373,14 @@ def identified_or_known_load(memory: Array, known: Identification) -> Identifica
     """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    phi = memory[_KNOWN_LOAD_START + 6 : _KNOWN_LOAD_START + 16].copy()
-    P = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START]
-    covariance = P.reshape(16, 16).copy()
+    theta = stored_known_load(memory).copy()
+    covariance = memory[_KNOWN_LOAD_START + 16 : _MONITOR_FILTER_START].reshape(16, 16).copy()
     return replace(
         known,
-        phi=phi,
-        offsets=memory[_KNOWN_LOAD_START : _KNOWN_LOAD_START + 6].copy(),
+        phi=theta[6:],
+        offsets=theta[:6],
         covariance=covariance,
-        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
         residual_rms=np.sqrt(memory[_KNOWN_RESIDUAL_SQUARES_START:_NEW_RESIDUAL_SQUARES_START]),
         method="recursive least squares",
         samples=int(memory[_IDENTIFIED_SAMPLES_INDEX]),

@@ -15,15 +15,6 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.load.online import change
-from drake_teleop.load.online.change import (
-    STATE_CHANGED,
-    STATE_KNOWN,
-    current_change_state,
-    new_load_age,
-    stored_known_load,
-    stored_new_load,
-    update_change_detector,
-)
 from drake_teleop.load.regressor import (
     SAMPLE_ANGULAR_VELOCITY,
     SAMPLE_MOTION,
@@ -122,23 +113,24 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
-    update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
-    known, residual, target = stored_known_load(watch), np.empty(6), np.empty(16)
+    change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
+    known, residual, target = change.stored_known_load(watch), np.empty(6), np.empty(16)
     wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    at_rest, verdict = _update_and_test_rest(memory, sample, period), current_change_state(watch)
-    force_changed = _update_and_test_force_change(memory, residual, new_load_age(watch), period)
-    if verdict == STATE_KNOWN:
+    at_rest = _update_and_test_rest(memory, sample, period)
+    verdict, age = change.current_change_state(watch), change.new_load_age(watch)
+    force_changed = _update_and_test_force_change(memory, residual, age, period)
+    if verdict == change.STATE_KNOWN:
         memory[_STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
         if at_rest and (low_passed <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / OFFSET_TRACKING_S * residual[i]
     elif memory[_STATE_INDEX] != STATE_OTHER_LOAD:
-        near = _is_com_of_change_within_reach(known, stored_new_load(watch))
-        other = verdict == STATE_CHANGED and force_changed and near
+        near = _is_com_of_change_within_reach(known, change.stored_new_load(watch))
+        other = verdict == change.STATE_CHANGED and force_changed and near
         memory[_STATE_INDEX] = STATE_OTHER_LOAD if other else STATE_DISTURBED
     copy_into(target, 0, known, 0, 16)
     if memory[_STATE_INDEX] == STATE_OTHER_LOAD:

@@ -39,9 +39,8 @@ _PLATFORM_OF_FMI_VERSION = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 def fmu_files(target: ControllerTarget) -> Files:
     """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
-    compiler = shutil.which("cc")
-    if platform.system() != "Linux" or platform.machine() != "x86_64":
-        compiler = None
+    is_linux64 = platform.system() == "Linux" and platform.machine() == "x86_64"
+    compiler = shutil.which("cc") if is_linux64 else None
     if compiler is None:
         target.notes.append("the FMUs contain sources only: there is no C compiler for linux64")
     kernel = dict(kernel_files(target))
@@ -130,11 +129,7 @@ def _model_description(
         time = {"name": "time", "valueReference": str(len(listed)), "causality": "independent"}
         SubElement(variables, "Float64", time | {"variability": "continuous"})
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
-    _add_output_unknowns(SubElement(root, "ModelStructure"), outputs, new)
-    return _XML_HEAD + indented_xml(root)
-
-
-def _add_output_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
+    structure = SubElement(root, "ModelStructure")
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:
@@ -142,6 +137,7 @@ def _add_output_unknowns(structure: Element, outputs: list[int], new: bool) -> N
                 SubElement(group, tag, valueReference=str(k))
             else:
                 SubElement(group, "Unknown", index=str(k + 1))
+    return _XML_HEAD + indented_xml(root)
 
 
 def _model_variables(target: ControllerTarget) -> list[tuple[str, str, str, float | None]]:
