@@ -64,11 +64,7 @@ class Format:
 
 
 def export_load(
-    found: Identification,
-    to: str,
-    *,
-    sensor_pose: Sequence[float] | None = None,
-    sign: int = -1,
+    found: Identification, to: str, *, sensor_pose: Sequence[float] | None = None, sign: int = -1
 ) -> tuple[str, list[str]]:
     """Return the text in the format `to`, and warnings.
 

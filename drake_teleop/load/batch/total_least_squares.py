@@ -123,7 +123,7 @@ def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: fl
 
 @dataclass(frozen=True, eq=False)
 class EstimatorOptions:
-    """Options of a batch estimator, as for `identify_batch`."""
+    """Options of `identify_batch`."""
 
     noise: NoiseStd
     offsets: bool = True

@@ -122,9 +122,9 @@ class NoiseFloor:
 
 @njit(cache=True)
 def noise_variances_into(held, s, omega, alpha, acceleration, variances, P, growth, fade, V, out):
-    """Write the variances (6,) of a sample's contact wrench into `out`; update `held` (2,).
+    """Write the variances (6,) of a sample's contact wrench into `out`.
 
-    `held` are the held squares of acceleration and alpha, `V` (6, 10) is scratch memory.
+    It updates the `held` squares of acceleration and alpha; `V` (6, 10) is scratch memory.
     """
     held[0] = max(dot(acceleration, acceleration), fade * held[0])
     held[1] = max(dot(alpha, alpha), fade * held[1])
