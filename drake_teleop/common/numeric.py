@@ -154,6 +154,6 @@ def narrowest_half_width_and_centre(x: Array) -> tuple[Array, Array]:
 
 
 def position_of_parabola_minimum(left: float, middle: float, right: float) -> float:
-    """Return the minimum of a parabola through values at -1, 0, 1, clipped; 0 without minimum."""
+    """Return where a parabola through values at -1, 0, 1 has its minimum, clipped; 0 if none."""
     bend = left - 2.0 * middle + right
     return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

@@ -42,7 +42,7 @@ from drake_teleop.robots.streams import (
 from drake_teleop.robots.watch import LOAD_WRENCH_ERROR_FRACTION, white_wrench_noise
 
 DELAY_FORGETTING_TIME_S = 10.0
-"""Time constant by which the estimate forgets samples [s]."""
+"""Time constant of the exponential weights of past samples [s]."""
 MAX_DELAY_STD_S = 5e-4
 """Maximum standard deviation of an estimate that changes the delay [s]."""
 MAX_DELAY_SLEW = 0.005

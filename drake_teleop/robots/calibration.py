@@ -120,7 +120,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom, (k,) each."""
+    """Return relative half-widths (95 %, `TOLERANCE_CONFIDENCE`) and degrees of freedom (k,)."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)
