@@ -65,7 +65,7 @@ def calibrate_command(
         stream.close()
     last = looks[-1]
     summary = identify_command(path, out, quiet=True, **processing)
-    write_picture(out / "settling.png", draw_uncertainty_over_time(looks, tolerance))
+    write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
         "known": dict(zip(tolerance.required_entry_names, last.is_known.tolist(), strict=True)),
@@ -144,7 +144,7 @@ def _parameter_verdict(evaluation: RecordEvaluation, k: int) -> str:
     return "almost" if evaluation.relative_half_widths[k] <= 1.0 else "not known"
 
 
-def draw_uncertainty_over_time(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

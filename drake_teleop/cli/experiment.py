@@ -68,11 +68,11 @@ def _simulate_participants(
     experiment: Experiment, scenarios: list[Scenario], store: TrialStore, count: int
 ) -> None:
     from drake_teleop.live.experiment.simulated import (
-        make_apparatus_by_task_and_condition,
+        make_apparatuses,
         simulate_participant,
     )
 
-    stations = make_apparatus_by_task_and_condition(experiment, scenarios)
+    stations = make_apparatuses(experiment, scenarios)
 
     def print_progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)

@@ -821,19 +821,17 @@ def _run_with_exit_status(arguments: list[str] | None) -> Any:
         click.echo(error.format_message())
         return 2
     except click.ClickException as error:
-        return _print_error_and_return_status(error.format_message())
+        return _print_error(error.format_message())
     except DrakeTeleopError as error:
-        return _print_error_and_return_status(str(error))
+        return _print_error(str(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click raises Abort from a KeyboardInterrupt, which contains the message.
         click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         return 130
     except OSError as error:
-        return _print_error_and_return_status(
-            f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        )
+        return _print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
 
-def _print_error_and_return_status(message: str) -> int:
+def _print_error(message: str) -> int:
     click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

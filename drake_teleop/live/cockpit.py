@@ -25,7 +25,7 @@ _WARNED_PACKET_SILENCE_S = 0.05  # s
 
 
 @njit(cache=True)
-def smallest_and_largest_force_into(vectors, origins, out):
+def force_range_into(vectors, origins, out):
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -72,9 +72,9 @@ class PageValueCalculator:
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        smallest_and_largest_force_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        smallest_and_largest_force_into(contact_S, zeros, contact)
-        smallest_and_largest_force_into(rows["force_to_master"], zeros, rendered)
+        force_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        force_range_into(contact_S, zeros, contact)
+        force_range_into(rows["force_to_master"], zeros, rendered)
         in_contact = (
             rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         )
@@ -93,15 +93,13 @@ class PageValueCalculator:
             "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
             "contact": bool(in_contact),
             "energy": _rounded_or_zero(self._energy, 5),
-            "words": list(dict.fromkeys(self._present_warnings(rows, inputs, zeros))),
+            "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
             "tool": _rounded_or_zero(self._last_row[1:], 5),
             "stylus": _rounded_or_zero(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _present_warnings(
-        self, rows: dict[str, Array], inputs: Inputs, zeros: Array
-    ) -> Iterator[str]:
+    def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -113,7 +111,7 @@ class PageValueCalculator:
         if self._forces[2, 1] >= _WARNED_LIMIT_FRACTION * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        smallest_and_largest_force_into(rows["hand_wrench_E"], zeros, hand)
+        force_range_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _WARNED_HAND_FORCE_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:

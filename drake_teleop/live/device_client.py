@@ -70,7 +70,7 @@ class DeviceClient:
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None
 
-    def exchange_packets_and_render_wrench(
+    def exchange_packets(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
         """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
@@ -182,9 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         while time.perf_counter() < end:
             largest = max(
                 largest,
-                float(
-                    np.linalg.norm((client.exchange_packets_and_render_wrench() or (0.0,) * 3)[:3])
-                ),
+                float(np.linalg.norm((client.exchange_packets() or (0.0,) * 3)[:3])),
             )
     except KeyboardInterrupt:
         pass

@@ -34,7 +34,7 @@ _CLIENT_END_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
 _LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_DURATION_AFTER_SILENCE_S = 0.05
+_CLUTCH_OPEN_AFTER_SILENCE_S = 0.05
 
 
 class DeviceLink:
@@ -127,10 +127,7 @@ class DeviceLink:
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / INPUT_UNIT_M
             values["r" + name] = turn[k] / INPUT_UNIT_RAD
-        if (
-            state.flags & CLUTCH_OPEN
-            or now - self._connected_at < _CLUTCH_OPEN_DURATION_AFTER_SILENCE_S
-        ):
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_AFTER_SILENCE_S:
             values["clutch"] = 0
         return values
 

@@ -66,12 +66,10 @@ def unpack_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE_FORMAT.size or packet[:4] != _STATE_TAG:
         return None
     _, flags, number, t, *numbers = _STATE_FORMAT.unpack(packet)
-    return make_state_if_plausible(number, t, flags, numbers)
+    return valid_state(number, t, flags, numbers)
 
 
-def make_state_if_plausible(
-    number: int, t: float, flags: int, numbers: Sequence[float]
-) -> DeviceState | None:
+def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
     """Return the state, or None if position, orientation or `behind` is implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)

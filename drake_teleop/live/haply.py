@@ -17,7 +17,7 @@ from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DevicePose,
     DeviceState,
-    make_state_if_plausible,
+    valid_state,
 )
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
@@ -49,7 +49,7 @@ def parse_device_message(text: Any) -> DeviceMessage | None:
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = make_state_if_plausible(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    state = valid_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else DeviceMessage(name, state)
 
 

@@ -195,10 +195,10 @@ def input_range(name: str) -> tuple[int, int]:
     return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
 
 
-_PACKAGE_VERSION = {"drake_teleop": __version__}
+_VERSION = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _PACKAGE_VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _VERSION) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -209,16 +209,12 @@ def csv_row(ms: int, inputs: Inputs) -> str:
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(
-    path: Path, made_by: Mapping[str, str] = _PACKAGE_VERSION
-) -> list[tuple[int, Inputs]]:
+def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
     """Return the recorded times [ms] and inputs of each change; the last is the end."""
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:
-        raise _not_repeatable_error(
-            "does not contain the version of drake_teleop that wrote it", path
-        )
+        raise _not_repeatable("does not contain the version of drake_teleop that wrote it", path)
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
             "does not contain the inputs of a recorded live session",
@@ -231,7 +227,7 @@ def read_inputs(
             found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _not_repeatable_error(changed if name == "files" else what, path)
+            raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError(
@@ -240,7 +236,7 @@ def read_inputs(
     return changes
 
 
-def _not_repeatable_error(what: str, path: Path) -> DrakeTeleopError:
+def _not_repeatable(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
     remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
@@ -260,7 +256,7 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _not_repeatable_error(f"has the unknown {name} {line[column]!r}", path)
+                raise _not_repeatable(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

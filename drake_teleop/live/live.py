@@ -206,21 +206,21 @@ class Live:
         return self._session.ms
 
     @property
-    def is_simulation_halted(self) -> bool:
+    def is_halted(self) -> bool:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
         return max(
             0.0,
-            frame if self.is_simulation_halted else min(frame, self.pace.time_to_next_slice(now)),
+            frame if self.is_halted else min(frame, self.pace.time_to_next_slice(now)),
         )
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
         for _ in range(_MAX_SLICES_PER_TICK):
             now = clock()
-            if self.is_simulation_halted or self.pace.time_to_next_slice(now) > 0:
+            if self.is_halted or self.pace.time_to_next_slice(now) > 0:
                 break
             self.pace.begin_slice(now)
             self._simulate_slice(now)
@@ -258,9 +258,7 @@ class Live:
         self._show_now |= self._requested.hand_inputs != self._last_target
         self._last_target = self._requested.hand_inputs
         try:
-            self._session.apply_inputs(
-                self._limited_inputs(self._requested.with_changes(by_device))
-            )
+            self._session.apply_inputs(self._limited(self._requested.with_changes(by_device)))
         except _SESSION_FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
@@ -279,7 +277,7 @@ class Live:
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
-    def _limited_inputs(self, wanted: Inputs) -> Inputs:
+    def _limited(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
         return self._limiter.limit_inputs(wanted, may_jump=free)
@@ -363,12 +361,10 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     for kind in ("set", "rates"):
         values = message.get(kind)
         if isinstance(values, dict):
-            found[kind] = {
-                name: value for name, value in values.items() if _is_finite_number(value)
-            }
+            found[kind] = {name: value for name, value in values.items() if _is_finite(value)}
     if isinstance(message.get("pause"), bool):
         found["pause"] = message["pause"]
-    if _is_finite_number(message.get("slow")):
+    if _is_finite(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
     if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
@@ -376,7 +372,7 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     return found or None
 
 
-def _is_finite_number(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

@@ -32,13 +32,13 @@ _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD = 0.5
 _DELAY_INPUT_UNIT_S, _JITTER_INPUT_UNIT, _LOSS_INPUT_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the user.
-_SCENARIO_OF_SCENE = {
+_SHIPPED_SCENES = {
     "leaf": "touch",
     "slot": "peg_in_slot",
     "wall": "touch",
     "block": "push_block",
 }
-SCENE_NAMES = ("own", *_SCENARIO_OF_SCENE)
+SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -65,7 +65,7 @@ def load_scene(name: str, own: Scenario) -> Scenario:
     """Return the scenario of a scene in `SCENE_NAMES`; `own` is the user's scenario."""
     if name == "own":
         return own
-    scenario = LoadScenario(_SCENARIO_OF_SCENE[name])
+    scenario = LoadScenario(_SHIPPED_SCENES[name])
     if name == "wall":
         wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
         changes = {"sheet_spring": None, "environment": [wall], "description": "a wall to press on"}

@@ -117,7 +117,7 @@ class LiveDrive:
             self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
             self._views[name] = PageScene(name, self._scene_scenarios[name])
             progress(len(self._views) / (1 + len(SCENE_NAMES)))
-        compile_session_functions(scenario, self._load, device)
+        compile_slice_functions(scenario, self._load, device)
         progress(1.0)
 
     def wait(self) -> None:
@@ -351,9 +351,7 @@ def _identify_load(scenario: Scenario, progress: bool | StartStage) -> Identifie
     return identified_load(dataclasses.replace(scenario, contact_detection=detection), progress)
 
 
-def compile_session_functions(
-    scenario: Scenario, load: IdentifiedLoad | None, device: bool
-) -> None:
+def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
     """Compile the functions of the first simulation slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), PageValueCalculator(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately

@@ -133,9 +133,7 @@ class CrossFade(LeafSystem):
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc_wrench), inputs)
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            period, 0.0, self._update_fade_weight_and_force_limit
-        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_fade_and_limit)
 
     def StartFade(self, context: Context, start: float, length: float, rendered: Array) -> None:
         """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
@@ -153,7 +151,7 @@ class CrossFade(LeafSystem):
         force = _force_norm(self._wrench.Eval(context))
         return max(force - max_force, 0.0) if share == 1.0 else 0.0
 
-    def _update_fade_weight_and_force_limit(self, context: Context, state: DiscreteValues) -> None:
+    def _update_fade_and_limit(self, context: Context, state: DiscreteValues) -> None:
         share, max_force = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()

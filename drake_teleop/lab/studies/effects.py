@@ -24,7 +24,7 @@ from drake_teleop.lab.studies.level_model import (
     LevelModel,
     fit_level_model,
     largest_complete_block,
-    levels_of_factor_values,
+    factor_levels,
     missing_value_reasons,
 )
 
@@ -46,9 +46,7 @@ class Factorial:
     counts: list[int]
     has_value: BooleanArray
 
-    def comparable_levels_and_weights(
-        self, *shown: int
-    ) -> tuple[BooleanArray, BooleanArray, Array]:
+    def comparison_weights(self, *shown: int) -> tuple[BooleanArray, BooleanArray, Array]:
         """Return flags of the comparable levels of `shown` and of used combinations, and a matrix.
 
         For two factors, a level is a pair of levels. The matrix (comparable levels, n) maps values
@@ -66,9 +64,7 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        means = [
-            self.comparable_levels_and_weights(factor)[2] for factor in range(len(self.counts))
-        ]
+        means = [self.comparison_weights(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
@@ -235,9 +231,7 @@ class _MeasureData:
         self.table = fill_missing_values(values[used])
         points = rows.unique("point", keep="first").sort("point")
         columns = [points[factor.field].to_list() for factor in self.factors]
-        self.levels = [
-            levels_of_factor_values(f, c) for f, c in zip(self.factors, columns, strict=True)
-        ]
+        self.levels = [factor_levels(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
@@ -254,7 +248,7 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
-            is_compared, combinations, weights = self.model.comparable_levels_and_weights(factor)
+            is_compared, combinations, weights = self.model.comparison_weights(factor)
             if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
@@ -273,7 +267,7 @@ class _MeasureData:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.comparable_levels_and_weights(first, second)
+        is_compared, combinations, weights = self.model.comparison_weights(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.

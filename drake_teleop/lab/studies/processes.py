@@ -54,7 +54,7 @@ def open_executor(
             )
         yield RunExecutor(
             getattr(executor, "_max_workers", max(jobs, 1)),
-            lambda run, chunks: _run_on_given_executor(run, chunks, executor),
+            lambda run, chunks: _run_on_executor(run, chunks, executor),
         )
         return
     if cluster is None:
@@ -62,7 +62,7 @@ def open_executor(
 
         yield RunExecutor(
             effective_n_jobs(jobs),
-            lambda run, chunks: _run_in_local_processes(run, chunks, store, jobs),
+            lambda run, chunks: _run_locally(run, chunks, store, jobs),
         )
         return
     with _open_dask_client(cluster, jobs) as client:
@@ -71,9 +71,7 @@ def open_executor(
         yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _run_in_local_processes(
-    run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int
-) -> Iterator[Chunk]:
+def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
@@ -183,9 +181,7 @@ def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _run_on_given_executor(
-    run: RunRows, chunks: Sequence[Chunk], executor: Executor
-) -> Iterator[Chunk]:
+def _run_on_executor(run: RunRows, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
     futures = [executor.submit(run, chunk) for chunk in chunks]
     try:
         for future in as_completed(futures):

@@ -39,7 +39,7 @@ _RUN_SECONDS_KEY = "seconds"
 # waits at the end. The first chunks have one run, for early results and time estimates.
 _MAX_RUNS_PER_CHUNK = 8
 _TARGET_NUM_CHUNKS = 512
-_NUM_SINGLE_RUN_CHUNKS = 64
+_NUM_SINGLE_RUNS = 64
 # Number of latest runs for the estimate of the remaining time.
 _NUM_RUNS_FOR_TIME_ESTIMATE = 16
 
@@ -75,7 +75,7 @@ def run_study(
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _NUM_SINGLE_RUN_CHUNKS}  # chunks are identified by their first run
+    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
     schema = _schema_of_run_table(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     chunks = _group_into_chunks(first_rows)
@@ -101,9 +101,7 @@ def run_study(
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)
-                    new = study.next_points(
-                        points, _mean_objective_of_points(study, store, len(points))
-                    )
+                    new = study.next_points(points, _mean_objectives(study, store, len(points)))
                     chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
@@ -116,14 +114,12 @@ def run_study(
 
 def _group_into_chunks(rows: Chunk) -> list[Chunk]:
     size = min(max(len(rows) // _TARGET_NUM_CHUNKS, 1), _MAX_RUNS_PER_CHUNK)
-    chunks = [[row] for row in rows[:_NUM_SINGLE_RUN_CHUNKS]]
-    chunks += [
-        rows[first : first + size] for first in range(_NUM_SINGLE_RUN_CHUNKS, len(rows), size)
-    ]
+    chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
+    chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     return chunks
 
 
-def _mean_objective_of_points(study: Study, store: Store, points: int) -> Array:
+def _mean_objectives(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl

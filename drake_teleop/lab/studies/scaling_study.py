@@ -45,9 +45,7 @@ TASK_CRITERIA = {"reach": ("effort", "time")} | dict.fromkeys(
 )
 """Criteria of each task; free reaching has no contact."""
 _ETA_STUDY_NAME = "scaling_object"
-_SIGMA_FIELD, _GAMMA_FIELD, _ETA_FIELD = (
-    f"force_scaling.{name}" for name in ("sigma", "gamma", "eta")
-)
+_SIGMA_KEY, _GAMMA_KEY, _ETA_KEY = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
 _MAX_FAILED_RUN_SHARE, _MIN_SHARE_OF_DRAWS_AS_BEST = 0.05, 0.05
 
@@ -145,13 +143,13 @@ def _means_over_unscaled(table: Array, weights: Array) -> Array:
 
 def _sigmas_and_gammas() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
-    return factors[_SIGMA_FIELD], factors[_GAMMA_FIELD]
+    return factors[_SIGMA_KEY], factors[_GAMMA_KEY]
 
 
 def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     sigmas, gammas = _sigmas_and_gammas()
     seeds = rows["seed"].n_unique()
-    count = len(gammas) if _GAMMA_FIELD in rows.columns else 1
+    count = len(gammas) if _GAMMA_KEY in rows.columns else 1
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASK_CRITERIA[task]}
     tables = {}
     for name, measure in measures.items():
@@ -208,10 +206,10 @@ def _merit_table(
 
 
 def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    etas = sorted(rows[_ETA_FIELD].unique().to_list())
+    etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        values = values_by_seed(rows, measure, by=_ETA_FIELD)
+        values = values_by_seed(rows, measure, by=_ETA_KEY)
         figures = *means_and_half_widths_over_seeds(values), effect_half_widths_over_seeds(values)
         names = (measure, f"{measure}_half", f"{measure}_effect_half")
         for row, at_eta in zip(table, np.column_stack(figures), strict=True):

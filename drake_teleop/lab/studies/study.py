@@ -53,9 +53,7 @@ class StationRunFunction:
 
     def scenario(self, values: FactorValues, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(
-            _set_scenario_fields(self.scenario_data, changes), self.scenario_file
-        )
+        return ScenarioFromData(_set_fields(self.scenario_data, changes), self.scenario_file)
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         scenario, start = self.scenario(values, seed), time.monotonic()
@@ -107,7 +105,7 @@ def study_command(
     for index, factor in enumerate(study.factors):
         ranged = factor.low is not None and factor.high is not None
         for value in (factor.low, factor.high) if ranged else factor.level_values():
-            changed = _set_scenario_fields(packages, {factor.field: value})
+            changed = _set_fields(packages, {factor.field: value})
             place = f"{path}:factors[{index}]"
             config = settings_without_range_check(Scenario, changed, place)
             check_all_field_values(config, place)
@@ -141,7 +139,7 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _set_scenario_fields(data: Any, changes: dict[str, Any]) -> Any:
+def _set_fields(data: Any, changes: dict[str, Any]) -> Any:
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")

@@ -183,7 +183,7 @@ class OneAxisGammaSearch:
             for corner in self.stated_set.corners:
                 found = self.share_in_one_axis(axis, settings, gamma, *corner, seed)
                 share = min(share, found)
-                if not is_rendered_share_accepted(found, MAX_TUNED_FORCE_ERROR):
+                if not is_share_accepted(found, MAX_TUNED_FORCE_ERROR):
                     return -1.0
             shares[gamma] = share
             return 1.0
@@ -251,7 +251,7 @@ class OneAxisGammaSearch:
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
-def is_rendered_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
+def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     """Return whether a rendered share of the scaled contact force is accepted."""
     return abs(share - 1.0) <= max_error
 

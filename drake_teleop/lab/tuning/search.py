@@ -28,7 +28,7 @@ from drake_teleop.lab.tuning.press_trial import (
     OneAxisGammaSearch,
     StationPressTrial,
     TunedSettings,
-    is_rendered_share_accepted,
+    is_share_accepted,
     settings_from_values,
 )
 
@@ -111,7 +111,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _find_gamma_limit_in_station(settings_from_values(row), trial, execute)
+        gamma, inside = _find_station_gamma(settings_from_values(row), trial, execute)
         if inside:
             chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
@@ -130,7 +130,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     return SearchResult(chosen, search, given, inside, beyond)
 
 
-def _find_gamma_limit_in_station(
+def _find_station_gamma(
     settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
 ) -> tuple[float, list[Row]]:
     """Return the largest gamma up to that of `settings` that holds, and its runs; 0: none holds."""
@@ -143,9 +143,7 @@ def _find_gamma_limit_in_station(
     inside: list[Row] = []
     while gamma >= smallest:
         rows: list[Row] = []
-        for seed, (factor, hands, walls) in enumerate(
-            trial.stated_set.tested_gamma_factors_grips_and_walls
-        ):
+        for seed, (factor, hands, walls) in enumerate(trial.stated_set.tested_parts):
             tried = dataclasses.replace(settings, gamma=factor * gamma)
             name = f"station_{settings.method}_{gamma:.6g}_{seed}"
             rows += execute(name, _study_of_settings(tried, hands, walls, seed=seed), trial)
@@ -171,9 +169,7 @@ def meets_requirements(
 ) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
-    return bool(
-        row["rests"] and quiet and is_rendered_share_accepted(row["share"], max_force_error)
-    )
+    return bool(row["rests"] and quiet and is_share_accepted(row["share"], max_force_error))
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> RunStudy:

@@ -64,7 +64,7 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def tested_gamma_factors_grips_and_walls(self) -> list[tuple[float, list[str], list[float]]]:
+    def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
         """Factor of gamma, grips and walls of each part of the tests; each has its own seed.
 
         The softest grip fails first: it is tested twice. The last part has no margin.

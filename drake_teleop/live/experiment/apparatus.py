@@ -47,7 +47,7 @@ class Apparatus:
     load: IdentifiedLoad | None
     load_mass_at_hand: float
 
-    def stimulus_scales_percent(self, level: float, contact_force: float) -> dict[str, int]:
+    def stimulus_scales(self, level: float, contact_force: float) -> dict[str, int]:
         """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
         `level` is the rendered force [N] or mass [kg], `contact_force` the expected one [N].

@@ -37,7 +37,7 @@ _BLANK_FRAME_VALUES = {
 }
 
 #: Names of the inputs that move the hand.
-HAND_INPUT_NAMES_OF_PARTICIPANT = ("x", "y", "z", "rx", "ry", "rz", "clutch")
+PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
@@ -72,7 +72,7 @@ class GuidedExperiment:
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
-        self._stimulus = self._apparatus.stimulus_scales_percent(
+        self._stimulus = self._apparatus.stimulus_scales(
             procedure.current_level, procedure.expected_contact_force
         )
         name = f"{procedure.trial_number:04}-{procedure.interval}"
@@ -220,7 +220,7 @@ class GuidedExperiment:
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
         plain = Inputs()
         inputs = {name: getattr(plain, name) for name in INPUT_RANGES}
-        inputs |= {name: inner["inputs"][name] for name in HAND_INPUT_NAMES_OF_PARTICIPANT}
+        inputs |= {name: inner["inputs"][name] for name in PARTICIPANT_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
@@ -246,9 +246,7 @@ def parse_experiment_message(text: Any) -> dict[str, Any] | None:
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:
         found[kind] = {
-            name: value
-            for name, value in message[kind].items()
-            if name in HAND_INPUT_NAMES_OF_PARTICIPANT
+            name: value for name, value in message[kind].items() if name in PARTICIPANT_INPUTS
         }
     if "drive" in message:
         found["drive"] = True

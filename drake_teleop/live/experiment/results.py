@@ -57,7 +57,7 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    over = _geometric_or_share_mean_with_interval(
+                    over = _mean_with_interval(
                         [r.value for r in one], share=quantity == _DONE_SHARE_QUANTITY
                     )
                     trials = sum(r.trials for r in one)
@@ -76,12 +76,8 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
         interval = share.proportion_ci(method="wilson")
         found = {_DONE_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
-            found["time to the floor [s]"] = _geometric_or_share_mean_with_interval(
-                [row.time_s for row in done]
-            )
-            found["largest contact force [N]"] = _geometric_or_share_mean_with_interval(
-                [row.force_N for row in done]
-            )
+            found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
+            found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
         return found
     psi = PsiMethod(task.low, task.high)
     for row in rows:
@@ -93,9 +89,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
-def _geometric_or_share_mean_with_interval(
-    values: Sequence[float], *, share: bool = False
-) -> EstimateWithLimits:
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> EstimateWithLimits:
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:

@@ -12,11 +12,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment
 from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
-from drake_teleop.live.experiment.simulated import make_apparatus_by_task_and_condition
+from drake_teleop.live.experiment.simulated import make_apparatuses
 from drake_teleop.live.experiment.store import TrialStore
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_task_space_device
-from drake_teleop.live.server import LiveDrive, compile_session_functions, start_condition_text
+from drake_teleop.live.server import LiveDrive, compile_slice_functions, start_condition_text
 from drake_teleop.station.scenario import Scenario
 
 
@@ -34,7 +34,7 @@ class ExperimentDrive(LiveDrive):
     ) -> None:
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
-        self._stations = make_apparatus_by_task_and_condition(experiment, scenarios)
+        self._stations = make_apparatuses(experiment, scenarios)
         self.procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
@@ -44,7 +44,7 @@ class ExperimentDrive(LiveDrive):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
         first = self._stations[0, 0]
-        compile_session_functions(first.scenario, first.load, device)
+        compile_slice_functions(first.scenario, first.load, device)
 
     def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link

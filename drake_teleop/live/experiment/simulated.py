@@ -41,7 +41,7 @@ _HAND_MOTION_START_S = 0.4
 _LOG_READ_PERIOD_MS = 200
 
 
-def make_apparatus_by_task_and_condition(
+def make_apparatuses(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
@@ -74,7 +74,7 @@ def simulate_participant(
         if procedure.phase == INTERVAL_PHASE:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                result = _run_peg_insertion(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _insert_peg(apparatus, scenarios[procedure.trial.task], procedure)
             else:
                 result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
@@ -106,9 +106,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.stimulus_scales_percent(
-        procedure.current_level, procedure.expected_contact_force
-    )
+    stimulus = apparatus.stimulus_scales(procedure.current_level, procedure.expected_contact_force)
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _HAND_MOTION_START_S
     while session.ms < 1e3 * task.interval:
@@ -131,7 +129,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     ), rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _run_peg_insertion(
+def _insert_peg(
     apparatus: Apparatus, task_scenario: Scenario, procedure: Procedure
 ) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
