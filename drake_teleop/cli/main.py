@@ -436,15 +436,13 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
         words += ["--out", str(out)]
         given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
         given |= {"--sensor-frame": "sensor_frame", "--motion": "motion"}
+        given |= {"--range": "largest", "--sensor-pose": "sensor_pose"}
         for name, parameter in given.items():
             if (value := ctx.params[parameter]) is not None:
-                words += [name, str(value)]
-        for name, parameter in (("--range", "largest"), ("--sensor-pose", "sensor_pose")):
-            if (numbers := ctx.params[parameter]) is not None:
-                words += [name, *map(str, numbers)]
-        return words + [
-            x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
-        ]
+                words += [name, *map(str, value if isinstance(value, tuple) else [value])]
+        for path in ctx.params["package_paths"]:
+            words += ["--package-path", str(path)]
+        return words
 
     run_ros2_command(source, load, sink, out, calibrate=calibrate_arguments, **options)
 
@@ -606,14 +604,9 @@ def compare_passivity(
     degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
     pictures and report.html.
     """
-    from drake_teleop.lab.comparison import compare_passivity as comparison
+    from drake_teleop.lab.comparison.compare_passivity import NETWORKS, compare_command
 
-    comparison.compare_command(
-        out,
-        networks=networks or comparison.NETWORKS,
-        methods=methods,
-        **options,
-    )
+    compare_command(out, networks=networks or NETWORKS, methods=methods, **options)
 
 
 @cli.command()

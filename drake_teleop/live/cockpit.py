@@ -17,7 +17,7 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
-#: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
+#: Contact force at the slave that the page shows as contact [N]; noise and motion remain below.
 MIN_CONTACT_FORCE_N = 2.0
 _WARNED_LIMIT_FRACTION = 0.999
 _WARNED_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
@@ -26,6 +26,7 @@ _WARNED_PACKET_SILENCE_S = 0.05  # s
 
 @njit(cache=True)
 def force_range_into(vectors, origins, out):
+    """Write the smallest and largest norm of the rows' first three elements minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -37,6 +38,7 @@ def force_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
+    """Add the work of the hand, and that of the tool on its contacts without torque, [J] (2,)."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -75,9 +77,7 @@ class PageValueCalculator:
         force_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
         force_range_into(contact_S, zeros, contact)
         force_range_into(rows["force_to_master"], zeros, rendered)
-        in_contact = (
-            rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
-        )
+        touches = rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         self._forces[:2] *= inputs.force_scales["force_scale"]
         _integrate_hand_and_contact_work(
             self._table,
@@ -91,7 +91,7 @@ class PageValueCalculator:
         )
         return {
             "f": [_rounded_or_zero(pair, 4) for pair in self._forces],
-            "contact": bool(in_contact),
+            "contact": bool(touches),
             "energy": _rounded_or_zero(self._energy, 5),
             "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),

@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_S = 0.02  # s
-_FORCE_RISE_N_S = 100.0  # N/s
+_FORCE_RISE_N_S = 100.0  # N/s, of the force limit after silence
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 

@@ -109,10 +109,8 @@ class HaplyDevice:
             ) from error
         if message is None:
             return None
-        self._device = message.device_name
-        return DevicePose(
-            message.state.position, message.state.quaternion_wxyz, message.state.flags
-        )
+        self._device, state = message
+        return DevicePose(state.position, state.quaternion_wxyz, state.flags)
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed

@@ -61,9 +61,9 @@ class Inputs:
         rx, ry, rz: intended rotation vector in B [0.1 mrad].
         held: 1 while the hand holds the stylus.
         clutch: 1 while motion is transmitted.
-        sigma: scale of the gripper's (or whole) non-contact wrench [%].
+        sigma: scale of the non-contact wrench of the gripper, or of an undivided load [%].
         sigma_weight: scale of the load's weight alone [%]; -1: as its inertia.
-        sigma_object: scale of a gripped object's non-contact wrench [%].
+        sigma_object: the same of a gripped object [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
         network, method, grip, sensor: index into `choice_names()`.
@@ -97,10 +97,8 @@ class Inputs:
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Inputs:
-        sigma, sigma_object, gamma = (
-            round(s / _SIGMA_UNIT) for s in scenario.force_scaling.scales()[:3]
-        )
         config = scenario.force_scaling
+        sigma, sigma_object, gamma = (round(s / _SIGMA_UNIT) for s in config.scales()[:3])
         apart = config.sigma_weight is not None or config.sigma_inertia is not None
         weight = round(config.scales().weight_gripper / _SIGMA_UNIT) if apart else -1
         started = cls(
@@ -142,10 +140,8 @@ class Inputs:
         """Return the intended pose X_BE (7,) from the `start` (3,); None if released."""
         if not self.held:
             return None
-        turn = quaternion_exponential(
-            tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
-        )
-        return np.concatenate([turn, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
+        q = quaternion_exponential(tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz)))
+        return np.concatenate([q, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
 
     def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
@@ -221,11 +217,10 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             where=str(path),
             remedy=f"use the columns {', '.join(_CSV_COLUMNS)}",
         )
-    recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
+    recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
-        if recorded_with.get(name) != value:
-            found = recorded_with.get(name, "unknown")
-            what = f"was recorded with {name} {found}, and this is {value}"
+        if recorded.get(name) != value:
+            what = f"was recorded with {name} {recorded.get(name, 'unknown')}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
             raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
@@ -247,11 +242,8 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
         if len(line) != len(_CSV_COLUMNS):
-            raise DrakeTeleopError(
-                f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column",
-                where=where,
-                remedy="use the file as recorded",
-            )
+            what = f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column"
+            raise _invalid_row(what, where)
         for column, name in enumerate(_CSV_COLUMNS):
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
@@ -260,24 +252,18 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
         try:
             ms, *values = map(int, line)
         except ValueError:
-            raise DrakeTeleopError(
-                "has a value that is not a whole number (all inputs are integers)",
-                where=where,
-                remedy="use the file as recorded",
-            ) from None
+            what = "has a value that is not a whole number (all inputs are integers)"
+            raise _invalid_row(what, where) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
-            raise DrakeTeleopError(
-                f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)",
-                where=where,
-                remedy="use the file as recorded",
-            )
+            what = f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)"
+            raise _invalid_row(what, where)
         earlier, inputs = ms, dict(zip(INPUT_RANGES, values, strict=True))
         for name in INPUT_RANGES:
             low, high = input_range(name)
             if not low <= inputs[name] <= high:
-                raise DrakeTeleopError(
-                    f"{name} = {inputs[name]} is outside {low} to {high}",
-                    where=where,
-                    remedy="use the file as recorded",
-                )
+                raise _invalid_row(f"{name} = {inputs[name]} is outside {low} to {high}", where)
         yield ms, Inputs(**inputs)
+
+
+def _invalid_row(what: str, where: str) -> DrakeTeleopError:
+    return DrakeTeleopError(what, where=where, remedy="use the file as recorded")

@@ -99,17 +99,15 @@ class Live:
         folder = None if self._record is None else _unused_folder_path(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
-        by_device = self._link is not None
-        self._session = Session(
-            self._scenario, self._load, log=log, record=folder, device=by_device
-        )
+        device = self._link is not None
+        self._session = Session(self._scenario, self._load, log=log, record=folder, device=device)
         self._folder = "" if folder is None else str(folder)
         self._session.apply_inputs(self._session.inputs.with_changes(self._initial))
         if self._link is not None:
             self._link.reset_pose_origin(now)
         scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
-        self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
+        self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=device)
         self._cockpit, self.stopped = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
@@ -285,9 +283,8 @@ class Live:
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()
         if len(rows["t"]):
-            self._last_frame = self._cockpit.page_values(
-                rows, self._session.inputs
-            ) | self._scene_part(rows)
+            values = self._cockpit.page_values(rows, self._session.inputs)
+            self._last_frame = values | self._scene_part(rows)
         inputs = self._requested
         words = self._last_frame.get("words", [])
         if self._session.is_channel_filling:

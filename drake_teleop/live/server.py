@@ -162,10 +162,7 @@ class LiveDrive:
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            print(
-                f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}",
-                file=sys.stderr,
-            )
+            _print_to_stderr(f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}")
             sys.stdout.flush()
             os._exit(2)
 
@@ -232,11 +229,8 @@ class LiveDrive:
                     await self._change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
-                    ready = [
-                        c
-                        for c in server.connections
-                        if c.transport.get_write_buffer_size() < _MAX_UNSENT_BYTES
-                    ]
+                    pages = [(c, c.transport.get_write_buffer_size()) for c in server.connections]
+                    ready = [c for c, unsent in pages if unsent < _MAX_UNSENT_BYTES]
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
@@ -296,30 +290,23 @@ class LiveDrive:
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _make_response(
-                HTTPStatus.FORBIDDEN, "text/plain", b"The address requires its token.\n"
-            )
+            return _make_response(HTTPStatus.FORBIDDEN, b"The address requires its token.\n")
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
-                return _make_response(
-                    HTTPStatus.FORBIDDEN,
-                    "text/plain",
-                    b"Only this server's page may open the socket.\n",
-                )
+                refusal = b"Only this server's page may open the socket.\n"
+                return _make_response(HTTPStatus.FORBIDDEN, refusal)
             return None
         if path == "/":
             page = self._page_html()
-            content_policy = content_security_policy(page, host)
-            return _make_response(
-                HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
-            )
+            policy = content_security_policy(page, host)
+            return _make_response(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8", policy)
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
-            return _make_response(HTTPStatus.OK, "application/json", view.objects)
+            return _make_response(HTTPStatus.OK, view.objects, "application/json")
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
-            return _make_response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
-        return _make_response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
+            return _make_response(HTTPStatus.OK, script, "text/javascript; charset=utf-8")
+        return _make_response(HTTPStatus.NOT_FOUND, b"Not found.\n")
 
     async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
@@ -338,10 +325,8 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _print_to_stderr(
-                    "no page is open: the simulation waits"
-                    + _START_TEXT_ENDINGS[self._device is not None]
-                )
+                ending = _START_TEXT_ENDINGS[self._device is not None]
+                _print_to_stderr(f"no page is open: the simulation waits{ending}")
 
 
 def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
@@ -362,20 +347,18 @@ def compile_slice_functions(scenario: Scenario, load: IdentifiedLoad | None, dev
 
 
 def _make_response(
-    status: HTTPStatus, kind: str, body: bytes, content_policy: str = ""
+    status: HTTPStatus, body: bytes, kind: str = "text/plain", policy: str = "default-src 'none'"
 ) -> Response:
-    headers = Headers(
-        {
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-store",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Connection": "close",
-            "Content-Security-Policy": content_policy or "default-src 'none'",
-        }
-    )
-    return Response(status.value, status.phrase, headers, body)
+    headers = {
+        "Content-Type": kind,
+        "Content-Length": str(len(body)),
+        "Cache-Control": "no-store",
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Connection": "close",
+        "Content-Security-Policy": policy,
+    }
+    return Response(status.value, status.phrase, Headers(headers), body)
 
 
 def drive(

@@ -32,17 +32,13 @@ def copy_station_state(
     context.SetTime(then.get_time())
     sources = dict(_blocks_by_path(before))
     for path, block in _blocks_by_path(station):
-        source_block = sources.get(path)
-        if (
-            source_block is None
-            or type(source_block) is not type(block)
-            or excluded & set(path.split("/"))
-        ):
+        source, names = sources.get(path), path.split("/")
+        if source is None or type(source) is not type(block) or excluded & set(names):
             continue
         _copy_block_state(
-            source_block.GetMyContextFromRoot(then),
+            source.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
-            path.rpartition("/")[2] in _BLOCKS_WITH_CHANGED_PARAMETERS,
+            names[-1] in _BLOCKS_WITH_CHANGED_PARAMETERS,
         )
 
 

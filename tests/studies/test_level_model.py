@@ -9,7 +9,7 @@ from scipy.stats import qmc
 
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import effects_table, main_effects, pair_means
-from drake_teleop.lab.studies.level_model import fit_level_model, factor_levels
+from drake_teleop.lab.studies.level_model import factor_levels, fit_level_model
 
 UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)

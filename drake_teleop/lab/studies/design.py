@@ -204,14 +204,11 @@ class Study:
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
         drawn = self._draw_sobol_points(_NUM_ADAPTIVE_CANDIDATES, self.seed + len(points))
-        candidates = list(
-            {str(point): point for point in drawn if str(point) not in tried}.values()
-        )
+        candidates = list({str(p): p for p in drawn if str(p) not in tried}.values())
         if len(candidates) <= count:
             return candidates
-        chosen = propose_points(
-            self._coordinates(points), objective, self._coordinates(candidates), count
-        )
+        places, others = self._coordinates(points), self._coordinates(candidates)
+        chosen = propose_points(places, objective, others, count)
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
@@ -229,16 +226,10 @@ class Study:
         sobol = qmc.Sobol(len(self.factors), seed=np.random.default_rng(seed))
         shares = sobol.random_base2(count.bit_length() - 1)
         return [
-            {
-                factor.field: factor.value_at_share(u)
-                for factor, u in zip(self.factors, point, strict=True)
-            }
+            {f.field: f.value_at_share(u) for f, u in zip(self.factors, point, strict=True)}
             for point in shares.tolist()
         ]
 
     def _coordinates(self, points: Sequence[FactorValues]) -> Array:
-        rows = [
-            list(itertools.chain(*(f.coordinates(point[f.field]) for f in self.factors)))
-            for point in points
-        ]
-        return np.array(rows)
+        values = [[f.coordinates(point[f.field]) for f in self.factors] for point in points]
+        return np.array([np.concatenate(row) for row in values])

@@ -22,9 +22,9 @@ from drake_teleop.lab.studies.level_model import (
     TOO_FEW_POINTS,
     BooleanArray,
     LevelModel,
+    factor_levels,
     fit_level_model,
     largest_complete_block,
-    factor_levels,
     missing_value_reasons,
 )
 
@@ -206,9 +206,8 @@ def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
     data = _MeasureData(study, rows, measure)
-    return (
-        {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
-    )
+    factors = [] if data.is_empty else data.factors
+    return {factor.field: data.main_effect(k) for k, factor in enumerate(factors)}
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
@@ -245,7 +244,7 @@ class _MeasureData:
     def main_effect(self, factor: int) -> MainEffect:
         levels = self.levels[factor]
         count = len(levels.names)
-        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
+        figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW_POINTS] * count, 0
         if self.model is not None:
             is_compared, combinations, weights = self.model.comparison_weights(factor)
@@ -256,11 +255,8 @@ class _MeasureData:
                 compared = self._count_combinations(combinations, factor)
             why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        left_out = self._count_combinations(np.ones(1), factor) - compared
-        return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
-            self.is_fitted,
-        )  # fmt: skip
+        unused = self._count_combinations(np.ones(1), factor) - compared
+        return MainEffect(levels.names, runs, *figures, why, compared, unused, self.is_fitted)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
@@ -276,12 +272,9 @@ class _MeasureData:
         mean[~is_compared] = np.nan
         why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
         compared = self._count_combinations(combinations, first, second)
-        left_out = self._count_combinations(np.ones(1), first, second) - compared
-        fields = self.factors[first].field, self.factors[second].field
-        names = a.names, b.names
-        return PairMeans(
-            fields, names, mean.reshape(shape), why, compared, left_out, self.is_fitted
-        )
+        unused = self._count_combinations(np.ones(1), first, second) - compared
+        fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
+        return PairMeans(fields, names, mean.reshape(shape), why, compared, unused, self.is_fitted)
 
     @property
     def is_fitted(self) -> bool:

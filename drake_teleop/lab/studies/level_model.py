@@ -145,12 +145,8 @@ class LevelModel:
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
-            halves.append(
-                np.hypot(
-                    design * self._relative_std(terms),
-                    self._half_width_over_seeds(table, terms),
-                )
-            )
+            over_points = design * self._relative_std(terms)
+            halves.append(np.hypot(over_points, self._half_width_over_seeds(table, terms)))
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
@@ -159,9 +155,8 @@ class LevelModel:
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
         over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
-        return each.mean(axis=1), np.hypot(
-            self._half_width_over_points(table, 1) * self._relative_std(terms), over_seeds
-        )
+        over_points = self._half_width_over_points(table, 1) * self._relative_std(terms)
+        return each.mean(axis=1), np.hypot(over_points, over_seeds)
 
     def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))

@@ -145,7 +145,6 @@ class StudyProgress:
         self._report_progress()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
             if _RUN_SECONDS_KEY in row:  # missing if the run ended its process
@@ -158,9 +157,8 @@ class StudyProgress:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
-            words = (
-                f"about {_format_duration(float(np.median(self._recent)) * left / at_once)} left"
-            )
+            seconds = float(np.median(self._recent)) * left / at_once
+            words = f"about {_format_duration(seconds)} left"
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
 
 
@@ -169,9 +167,7 @@ def _format_duration(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
-def _run_chunk(
-    work: RunFunction, names: Sequence[str], rows: Sequence[dict[str, Any]]
-) -> list[dict[str, Any]]:
+def _run_chunk(work: RunFunction, names: Sequence[str], rows: Chunk) -> Chunk:
     found = []
     with one_blas_thread():
         for row in rows:

@@ -82,9 +82,7 @@ def scaling_study_command(
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
     sigmas, gammas = _sigmas_and_gammas()
-    answers = {
-        selection: rate_scales(tables, criteria) for selection, criteria in CRITERIA_SETS.items()
-    }
+    answers = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
@@ -251,14 +249,12 @@ def draw_best_scales(
     # The colour scale is symmetric about 1 in ratios; excluded points are grey.
     ends = 2.0**-farthest, 2.0**farthest
     scale = LogNorm(*ends)
-    colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
+    cmap = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
         for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):
-            drawn = axes.imshow(
-                found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
-            )
+            drawn = axes.imshow(found.merit, origin="lower", aspect="auto", cmap=cmap, norm=scale)
             axes.grid(False)
             axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])

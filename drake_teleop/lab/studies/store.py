@@ -46,9 +46,8 @@ class Store:
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        write_table(
-            self.folder / _PART_FILE_NAME.format(rows["run"][0]), rows, temporary_base=self.folder
-        )
+        path = self.folder / _PART_FILE_NAME.format(rows["run"][0])
+        write_table(path, rows, temporary_base=self.folder)
 
     def count_chunk_start(self, first_run: int) -> None:
         """Count one more start of the chunk that starts with `first_run`."""

@@ -117,13 +117,9 @@ class StationPressTrial:
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base_scenario.channel
         task = short_press_task(sum(line.delay for line in channel.networks_of_directions()))
+        depth = renderable_press_depth(self.base_scenario, grip)
         setup, _ = delayed_contact(
-            scenario,
-            channel,
-            scenario.passivity,
-            wall,
-            task=task,
-            depth=renderable_press_depth(self.base_scenario, grip),
+            scenario, channel, scenario.passivity, wall, task=task, depth=depth
         )
         setup = replace(setup, sheet_spring__slip_speed=_LEAF_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.load_estimate)
@@ -191,11 +187,9 @@ class OneAxisGammaSearch:
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
         if stability_sign(high) < 0:
-            limit = (
-                bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
-                if stability_sign(low) > 0
-                else -np.inf
-            )
+            limit = -np.inf
+            if stability_sign(low) > 0:
+                limit = bisect(stability_sign, low, high, xtol=_LOG_GAMMA_RESOLUTION)
         gamma = max((g for g in shares if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
@@ -220,21 +214,16 @@ class OneAxisGammaSearch:
         wall: float,
         seed: int,
     ) -> float:
-        """Return the rendered share of the contact force; 0: unstable."""
+        """Return the rendered share of the contact force; 0: unstable or too noisy at rest."""
         forward, backward = self.base_scenario.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
-        shown = {
-            entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(AxisParameters)
-        }
+        shown = {f.name: getattr(axis, f.name) for f in dataclasses.fields(AxisParameters)}
         model = OneDof(**shown | {
             "hand_mass": hand.mass, "hand_damping": hand.damping,
             "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
         })  # fmt: skip
-        added = (
-            0.0
-            if self.base_scenario.wrist_sensor.ideal
-            else _FILTER_DELAY_CYCLES / settings.low_pass_hz
-        )
+        ideal = self.base_scenario.wrist_sensor.ideal
+        added = 0.0 if ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
         run = run_one_dof(
             model,
@@ -273,14 +262,14 @@ def short_press_task(round_trip: float) -> Task:
 
 
 def renderable_press_depth(base: Scenario, grip: str) -> float:
-    """Return the displacement [m] into a wall that the device can render to the grip."""
+    """Return the hand's displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
     return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above_hz(x: Array, period: float, frequency: float) -> float:
-    """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
+    """Return the rms of x (N,) above a frequency [Hz], without parabola; inf for invalid x."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

@@ -7,7 +7,7 @@ its softest and stiffest wall and between them, with several seeds.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,9 +43,8 @@ BEYOND_MARGIN_FACTOR = 1.2
 _LOW_PASSES_HZ = (100.0, 50.0)  # Hz, below the sensor's own
 _MAX_GAMMA_REDUCTION = 16.0  # from the limit in one axis to that of the station
 _MAX_UNSTABLE_OVER_STABLE_GAMMA = 1.15  # of unstable to stable gamma, where the bisection ends
-_GAMMA_STEP_ABOUT_NOISE_LIMIT = (
-    1.03  # gamma fails and holds by so much above and below that of accepted noise
-)
+# Gamma fails and holds by this factor above and below that of accepted noise.
+_GAMMA_STEP_ABOUT_NOISE_LIMIT = 1.03
 
 Row = dict[str, Any]
 RunStudy = Callable[[str, Study, Any], list[Row]]
@@ -76,16 +75,10 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
-    given = execute(
-        "as_given",
-        _study_of_settings(TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own), ends, [stiffest]),
-        trial,
-    )
-    quiet = execute(
-        "noise",
-        _study_of_settings(TunedSettings("ledger", 1.0, 0.0, own), ends, [stiffest]),
-        trial,
-    )
+    unscaled = TunedSettings(GIVEN_SETTINGS_NAME, 1.0, 0.0, own)
+    given = execute("as_given", _study_of_settings(unscaled, ends, [stiffest]), trial)
+    unscaled = dataclasses.replace(unscaled, method="ledger")
+    quiet = execute("noise", _study_of_settings(unscaled, ends, [stiffest]), trial)
     noise = max(1e-9, *(row["rest_force_N"] for row in quiet))  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
@@ -164,9 +157,7 @@ def _find_station_gamma(
     return stable, inside
 
 
-def meets_requirements(
-    row: Mapping[str, Any], max_force_error: float = MAX_RENDERED_FORCE_ERROR
-) -> bool:
+def meets_requirements(row: Row, max_force_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
     """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and is_share_accepted(row["share"], max_force_error))
@@ -194,10 +185,8 @@ def _add_predicted_threshold(
     row: Row, trial: StationPressTrial, noise_N_by_low_pass_hz: dict[float, float]
 ) -> Row:
     gamma = row["gamma_limit"] / trial.stated_set.requirements.loop_gain_margin
-    human, scale = (
-        trial.base_scenario.operator.perception,
-        trial.base_scenario.force_scaling.force_scale,
-    )
+    human = trial.base_scenario.operator.perception
+    scale = trial.base_scenario.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _rms_load_force_in_swing(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)
     noise = 2 * noise_N_by_low_pass_hz[row["low_pass_hz"]] * gamma

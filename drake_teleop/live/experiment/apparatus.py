@@ -39,7 +39,10 @@ def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task and condition; `load_mass_at_hand`: perceived mass at load scale 1 [kg]."""
+    """Station of a task and condition.
+
+    `load_mass_at_hand` [kg] is the perceived mass of the load (with eta, of the object) at scale 1.
+    """
 
     task: Task
     condition: Condition
@@ -70,9 +73,8 @@ class Apparatus:
         """Return the result of an interval; `target`: intended level (0: no stimulus)."""
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, PegInSlot):
-            return IntervalResult(
-                force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
-            )
+            time_s = rows.done_at or rows.time
+            return IntervalResult(force_N=force, done=rows.done_at > 0.0, time_s=time_s)
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
             return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
@@ -93,18 +95,16 @@ def make_apparatus(
     if condition.method != AS_IN_SCENARIO:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
-    empty = NominalSlave(setup.slave).arm.phi_load[0]
+    mass = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        with_object = chosen_scenario(
-            setup, load, Inputs.from_scenario(setup).with_changes({"object": 1})
-        )
+        inputs = Inputs.from_scenario(setup).with_changes({"object": 1})
+        with_object = chosen_scenario(setup, load, inputs)
         estimate = adapt_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
         setup = with_object
     setup.check()
-    mass = empty
     if condition.eta is not None:
         mass = setup.slave.payload.mass
     at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale

@@ -28,13 +28,7 @@ _SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_BLANK_FRAME_VALUES = {
-    "contact": False,
-    "energy": [0.0, 0.0],
-    "words": [],
-    "record": "",
-    "scene": "own",
-}
+_BLANK_FRAME_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": ""}
 
 #: Names of the inputs that move the hand.
 PARTICIPANT_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
@@ -204,9 +198,8 @@ class GuidedExperiment:
         if live.ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
-        result = self._apparatus.interval_result(
-            self._procedure.current_level, self._stimulus, self._rows
-        )
+        level = self._procedure.current_level
+        result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         result = dataclasses.replace(result, lost_s=live.pace.lost_time_s)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
@@ -226,6 +219,7 @@ class GuidedExperiment:
             **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
             **_BLANK_FRAME_VALUES,
             "f": [rendered] * 3,
+            "scene": "own",
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,
             "drive": self._intervals,

@@ -53,10 +53,8 @@ class ExperimentDrive(LiveDrive):
         return GuidedExperiment(*setup, time.perf_counter(), link)
 
     def _page_html(self) -> str:
-        panel = (
-            resources.files("drake_teleop.live.experiment").joinpath("page.html").read_text("utf-8")
-        )
-        return super()._page_html().replace("</body>", panel + "</body>")
+        panel = resources.files("drake_teleop.live.experiment") / "page.html"
+        return super()._page_html().replace("</body>", panel.read_text("utf-8") + "</body>")
 
 
 def serve_experiment(

@@ -124,21 +124,18 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
             rows.add_rows(session.new_rows())
     rows.add_rows(session.new_rows())
     session.close()
-    return apparatus.interval_result(
-        procedure.current_level, stimulus, rows
-    ), rows.largest_rendered_force_change(_HAND_MOTION_START_S)
+    result = apparatus.interval_result(procedure.current_level, stimulus, rows)
+    return result, rows.largest_rendered_force_change(_HAND_MOTION_START_S)
 
 
-def _insert_peg(
-    apparatus: Apparatus, task_scenario: Scenario, procedure: Procedure
-) -> IntervalResult:
+def _insert_peg(apparatus: Apparatus, base: Scenario, procedure: Procedure) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
-    assert isinstance(task, PegInSlot) and isinstance(task_scenario.operator.task, Insert)
+    assert isinstance(task, PegInSlot) and isinstance(base.operator.task, Insert)
     scenario = replace(
         with_interval_seed(apparatus.scenario, procedure),
-        operator__task=task_scenario.operator.task,
+        operator__task=base.operator.task,
         simulation__duration=task.timeout,
-        simulation__settle=task_scenario.simulation.settle,
+        simulation__settle=base.simulation.settle,
         simulation__end_with_task=True,
         force_scaling__sigma=condition.sigma,
         force_scaling__gamma=condition.gamma,
@@ -151,6 +148,5 @@ def _insert_peg(
     measures = task_measures(result, scenario)
     done = measures["success"] > 0.0
     time_s = measures["task_time_s"] if done else task.timeout
-    return IntervalResult(
-        force_N=float(true_contact_force_magnitudes(result).max()), done=done, time_s=time_s
-    )
+    force = float(true_contact_force_magnitudes(result).max())
+    return IntervalResult(force_N=force, done=done, time_s=time_s)
