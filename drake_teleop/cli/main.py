@@ -157,6 +157,10 @@ def drive(
 
         run_drive_command(scenario, record=record, **options)
         return
+    option.refuse_given_options("record", remedy="remove it: --results contains the recording")
+    if simulated:
+        names = ("participant", "port", "no_browser", "device")
+        option.refuse_given_options(*names, remedy="remove it or --simulated")
     from drake_teleop.cli.experiment import experiment_command
 
     experiment_command(study, results, participant=participant, simulated=simulated, **options)
@@ -371,13 +375,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=option.POSITIVE_TYPE,
-    metavar="HZ",
-    help="Rate of the wrenches; not needed for replay:, rtde:// and netft://.",
-)
+@option.rate_hz("Rate of the wrenches; not needed for replay:, rtde:// and netft://.")
 @click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @click.option(
@@ -416,8 +414,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option("--rate", "rate_hz", type=option.POSITIVE_TYPE, required=True, metavar="HZ",
-              help="Rate of the wrenches.")  # fmt: skip
+@option.rate_hz("Rate of the wrenches.", required=True)
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @option.stream_options
 @option.output_folder("ros2")
@@ -498,13 +495,7 @@ _EXPORT_FORMAT_TYPE = option.RegisteredName(
     show_default=True,
     help="As in the log description: -1 if the sensor measures the wrench of the load on it.",
 )
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=option.POSITIVE_TYPE,
-    metavar="HZ",
-    help="Rate of the sensor's readings; required by c99, fmu and ros2_filter.",
-)
+@option.rate_hz("Rate of the sensor's readings; required by c99, fmu and ros2_filter.")
 @option.cutoff_hz
 @option.sensor_range
 @option.output_folder("export")
@@ -748,6 +739,9 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     It is a Fourier series from rest to rest, optimised and checked against every limit and for
     collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
     """
+    if options["until"] is not None:
+        remedy = "remove it or --until"
+        option.refuse_given_options("criterion", "period", "seconds", remedy=remedy)
     from drake_teleop.cli.excitation import excite_command
 
     excite_command(scenario, out, **options)

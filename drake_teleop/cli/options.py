@@ -275,6 +275,11 @@ def separate_sigmas(command: Any) -> Any:
     return command
 
 
+def rate_hz(text: str, *, required: bool = False) -> Callable[[Any], Any]:
+    named = {"type": POSITIVE_TYPE, "metavar": "HZ", "required": required, "help": text}
+    return click.option("--rate", "rate_hz", **named)
+
+
 def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
     text = "Frame or link of the model at which the wrist sensor measures."
     return click.option("--sensor-frame", required=required, metavar="NAME", help=text)

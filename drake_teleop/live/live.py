@@ -23,7 +23,6 @@ from drake_teleop.live.inputs import (
     MAX_DURATION_MS,
     SLICE_MS,
     STATION_INPUTS,
-    Inputs,
     choice_names,
     input_range,
 )
@@ -209,10 +208,8 @@ class Live:
 
     def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
-        return max(
-            0.0,
-            frame if self.is_halted else min(frame, self.pace.time_to_next_slice(now)),
-        )
+        due = frame if self.is_halted else min(frame, self.pace.time_to_next_slice(now))
+        return max(0.0, due)
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
@@ -251,12 +248,15 @@ class Live:
             self.stopped = to_one_line(str(error))
 
     def _simulate_slice(self, now: float) -> None:
-        by_device = {} if self._link is None else self._link.hand_inputs(now)
         self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
         self._show_now |= self._requested.hand_inputs != self._last_target
         self._last_target = self._requested.hand_inputs
+        requested, may_jump = self._requested, not self._session.inputs.held
+        if self._link is not None:
+            requested = requested.with_changes(self._link.hand_inputs(now))
+            may_jump |= not requested.clutch
         try:
-            self._session.apply_inputs(self._limited(self._requested.with_changes(by_device)))
+            self._session.apply_inputs(self._limiter.limit_inputs(requested, may_jump=may_jump))
         except _SESSION_FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
@@ -274,11 +274,6 @@ class Live:
             self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
-
-    def _limited(self, wanted: Inputs) -> Inputs:
-        by_device = self._link is not None
-        free = not self._session.inputs.held or (by_device and not wanted.clutch)
-        return self._limiter.limit_inputs(wanted, may_jump=free)
 
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()

@@ -108,17 +108,15 @@ class LiveDrive:
     def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
-            self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
-
-    def _make_scenes(self, scenario: Scenario, device: bool, progress: UpdateProgress) -> None:
-        self._scene_scenarios: dict[str, Scenario] = {}
-        for name in SCENE_NAMES:
-            setup = load_scene(name, scenario)
-            self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
-            self._views[name] = PageScene(name, self._scene_scenarios[name])
-            progress(len(self._views) / (1 + len(SCENE_NAMES)))
-        compile_slice_functions(scenario, self._load, device)
-        progress(1.0)
+            progress = stage("Prepare the station and its 3D scenes")
+            self._scene_scenarios: dict[str, Scenario] = {}
+            for name in SCENE_NAMES:
+                setup = load_scene(name, scenario)
+                self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
+                self._views[name] = PageScene(name, self._scene_scenarios[name])
+                progress(len(self._views) / (1 + len(SCENE_NAMES)))
+            compile_slice_functions(scenario, self._load, device)
+            progress(1.0)
 
     def wait(self) -> None:
         """Wait for the end of the session, by `stop` or Ctrl-C.

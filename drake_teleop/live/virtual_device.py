@@ -9,7 +9,7 @@ from typing import TypeAlias
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _SIMULATION_STEPS_PER_MS = 10  # per ms
-_DEVICE_MASS_KG, _DEVICE_DAMPING_NS_M = 0.15, 0.5  # kg, N s/m
+_MASS_KG, _DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
 HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
 """Function from time [s] to intended position [m] and velocity [m/s]."""
 
@@ -19,7 +19,7 @@ class VirtualDevice:
 
     def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
-        self._mass, self._k, self._d = _DEVICE_MASS_KG + held.mass, held.stiffness, held.damping
+        self._mass, self._k, self._d = _MASS_KG + held.mass, held.stiffness, held.damping
         self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
         self.energy, self._t = 0.0, 0.0
 
@@ -32,12 +32,8 @@ class VirtualDevice:
             at, speed = self._hand(self._t)
             for i in range(3):
                 x, v = self.position[i], self.velocity[i]
-                pull = (
-                    force[i]
-                    - _DEVICE_DAMPING_NS_M * v
-                    + self._k * (at[i] - x)
-                    + self._d * (speed[i] - v)
-                )
+                elastic, damped = self._k * (at[i] - x), self._d * (speed[i] - v)
+                pull = force[i] - _DAMPING_NS_M * v + elastic + damped
                 v += h * pull / self._mass
                 self.velocity[i], self.position[i] = v, x + h * v
                 self.energy -= force[i] * h * v
