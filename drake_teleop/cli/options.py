@@ -77,8 +77,6 @@ class FiniteNumber(click.FloatRange):
 
 
 class IntegerInRange(click.IntRange):
-    """Parameter type of integers in a range."""
-
     name = "integer"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> int:
@@ -88,8 +86,6 @@ class IntegerInRange(click.IntRange):
 
 
 class DelayOrAuto(click.ParamType):
-    """Parameter type of a number of seconds, or "auto"."""
-
     name = "auto|SECONDS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:

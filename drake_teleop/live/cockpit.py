@@ -55,8 +55,6 @@ def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist,
 
 
 class PageValueCalculator:
-    """Calculator of the page's values from rows of the log."""
-
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints

@@ -121,7 +121,6 @@ class Inputs:
 
     @property
     def hand_inputs(self) -> tuple[int, ...]:
-        """Inputs that move the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property
@@ -137,7 +136,7 @@ class Inputs:
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,) from the `start` (3,); None if released."""
+        """Return the intended pose X_BE (7,); `start` (3,): p_BE at zero; None: released."""
         if not self.held:
             return None
         q = quaternion_exponential(tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz)))
@@ -206,7 +205,10 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the recorded times [ms] and inputs of each change; the last is the end."""
+    """Return the recorded times [ms] and inputs of each change; the last is the end.
+
+    Raise DrakeTeleopError if the file is invalid, or if its versions differ from `made_by`.
+    """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:

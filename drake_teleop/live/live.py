@@ -136,7 +136,6 @@ class Live:
         self.pace.restart(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the scenario's constants for a new page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",

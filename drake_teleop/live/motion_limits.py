@@ -17,8 +17,6 @@ _TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of rates (of keys, sticks) in simulated time."""
-
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
         self._at: dict[str, float] = {}
@@ -46,7 +44,10 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the hand's target: its speed, and for a device also its acceleration."""
+    """Limiter of the hand's target: its speed, and for a device also its acceleration.
+
+    `scales` are the tool's translation and rotation over the hand's.
+    """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _AxisLimiter] = {}

@@ -402,7 +402,6 @@ def run_drive_command(
 
 
 def start_condition_text(device: str | None) -> str:
-    """Return as text what starts the waiting simulation."""
     return "the simulation waits until this page is open" + _START_TEXT_ENDINGS[device is not None]
 
 

@@ -93,7 +93,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with signals that some stations lack."""
+    """Return the log with signals that some stations lack: commands as received, else zeros."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))

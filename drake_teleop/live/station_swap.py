@@ -28,7 +28,7 @@ _BLOCKS_WITH_CHANGED_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_station_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states, changeable parameters of `before` to `station`, except `excluded`."""
+    """Copy time, states, changeable parameters to `station`, except of blocks `excluded`."""
     context.SetTime(then.get_time())
     sources = dict(_blocks_by_path(before))
     for path, block in _blocks_by_path(station):

@@ -54,7 +54,7 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: FactorValue) -> list[float]:
-        """Return a number from 0 to 1, or an indicator (0 or 1) for each word, flag or vector."""
+        """Return the share (0 to 1) of the range of numbers, or an indicator of each word."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -167,7 +167,10 @@ class Study:
         return self.samples
 
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise above `MAX_RUNS` runs, or above `MAX_RUNS_WITHOUT_CONSENT` unless `yes`."""
+        """Raise DrakeTeleopError above `MAX_RUNS` runs, or without consent if they take days.
+
+        `yes` is the consent, or a function from a question to the user's answer.
+        """
         runs = self.num_points() * self.repeats
         count = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
@@ -212,7 +215,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[FactorValues], first: int = 0) -> list[dict[str, Any]]:
-        """Return a table row (run, point, seed, values) without measures for each run."""
+        """Return a table row (run, point, seed, values) for each run, from point `first`."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

@@ -69,6 +69,7 @@ class Factorial:
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
+        """Return the means over points, by `weights`, and over seeds, and their half widths."""
         mean, half = means_and_half_widths_over_seeds(weights @ table)
         return mean, np.hypot(half, self._half_widths_of_missing_seeds(table, weights))
 
@@ -180,7 +181,6 @@ class PairMeans:
 
 
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects by measure, factor and level."""
     import polars as pl
 
     table = [

@@ -41,7 +41,10 @@ def largest_complete_block(there: BooleanArray) -> tuple[BooleanArray, BooleanAr
 def missing_value_reasons(
     compared: BooleanArray, runs: NDArray[np.int64], good: NDArray[np.int64]
 ) -> list[str]:
-    """Return for each level or cell why it has no value; "" where `compared` is True."""
+    """Return for each level or cell why it has no value; "" where `compared` is True.
+
+    `runs` and `good` count its points, and its runs with a value.
+    """
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
@@ -107,7 +110,6 @@ class LevelModel:
         products: columns of X for each pair (i, j) of factors.
         failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
         X: (n, p) design matrix; first column: the mean.
-        pseudo_inverse: (p, n) pseudo-inverse of X.
     """
 
     factors: list[Levels]

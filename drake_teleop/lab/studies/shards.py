@@ -41,7 +41,6 @@ class Shard(NamedTuple):
 
 
 def parse_shard(text: str) -> Shard:
-    """Return the shard of a text such as "3/8"."""
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
         raise DrakeTeleopError(
@@ -51,7 +50,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Add the result files of all shards in `out` to its table, by hard links."""
+    """Link the result files of all shards in `out` into its table; raise if runs are missing."""
     names = [_SHARD_FOLDER_PATTERN.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:

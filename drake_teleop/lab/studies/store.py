@@ -31,7 +31,6 @@ class Store:
     folder: Path
 
     def first_runs_of_finished_chunks(self) -> set[int]:
-        """Return the first run of each stored chunk."""
         return set(map(_first_run_of_part, self.part_files()))
 
     def part_files(self) -> list[Path]:
@@ -50,7 +49,6 @@ class Store:
         write_table(path, rows, temporary_base=self.folder)
 
     def count_chunk_start(self, first_run: int) -> None:
-        """Count one more start of the chunk that starts with `first_run`."""
         path = self._start_counts_folder / str(first_run)
         with wrap_write_errors(path):
             self._start_counts_folder.mkdir(exist_ok=True)

@@ -42,7 +42,6 @@ class StationRunFunction:
     Args:
         scenario_data: content of the base scenario's file.
         scenario_file: name of that file, for messages.
-        measures: names of the measures.
         force_threshold_N: force [N] of time_above_force_s.
     """
 

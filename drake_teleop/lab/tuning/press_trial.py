@@ -59,14 +59,13 @@ GIVEN_SETTINGS_NAME = "as given"
 
 @dataclass(frozen=True)
 class TunedSettings:
-    """Settings that `tune` chooses."""
-
     method: str
     gamma: float
     sigma_inertia: float
     low_pass_hz: float
 
     def passivity(self, stated: StatedSet) -> PassivityConfig:
+        """Return the method's settings; `charged_tdpa` assumes the firmest stated hand."""
         hand = GRIP_IMPEDANCES[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
@@ -101,7 +100,7 @@ class StationPressTrial:
     Args:
         user_scenario: scenario of the user, with its own passivity and scales.
         base_scenario: the same without environment, task and passivity method.
-        load_estimate: (16,) load estimate.
+        load_estimate: (16,) [offsets, phi].
     """
 
     user_scenario: Scenario
@@ -241,7 +240,6 @@ class OneAxisGammaSearch:
 
 
 def is_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
-    """Return whether a rendered share of the scaled contact force is accepted."""
     return abs(share - 1.0) <= max_error
 
 

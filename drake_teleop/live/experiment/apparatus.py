@@ -33,7 +33,6 @@ _MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
 def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
-    """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
@@ -70,7 +69,10 @@ class Apparatus:
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval; `target`: intended level (0: no stimulus)."""
+        """Return the result of an interval with the intended level `target` (0: no stimulus).
+
+        `inputs` are its `stimulus_scales`.
+        """
         force = rows.largest_mean_contact_force()
         if isinstance(self.task, PegInSlot):
             time_s = rows.done_at or rows.time
@@ -152,7 +154,10 @@ class IntervalLog:
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def largest_rendered_force_change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
+        """Return the largest 20 ms mean of the rendered force's change [N] after time `after` [s].
+
+        The reference is the mean force of the 0.1 s before.
+        """
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
         rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)

@@ -163,7 +163,6 @@ class GuidedExperiment:
 
     @property
     def stopped(self) -> str:
-        """Failure that stops the simulation, or ""."""
         return self._live.stopped
 
     @property

@@ -21,8 +21,6 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of one participant's experiment, with its server."""
-
     def __init__(
         self,
         experiment: Experiment,
@@ -67,7 +65,6 @@ def serve_experiment(
     browser: bool,
     device: str | None,
 ) -> None:
-    """Serve the page of an experiment until Ctrl-C or SIGTERM."""
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)

@@ -53,7 +53,6 @@ def make_apparatuses(
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with the random seed of the present interval."""
     number = 2 * procedure.trial_number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
