@@ -87,11 +87,9 @@ def excite_command(
             })  # fmt: skip
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
-            raise DrakeTeleopError(
-                "is required with --model, which does not contain the sensor's position",
-                where="--sensor-frame",
-                remedy="name the frame or link at which it measures",
-            )
+            what = "is required with --model, which does not contain the sensor's position"
+            remedy = "name the frame or link at which it measures"
+            raise DrakeTeleopError(what, where="--sensor-frame", remedy=remedy)
         else:
             robot = RobotFromModel(
                 model,

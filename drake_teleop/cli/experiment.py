@@ -56,11 +56,8 @@ def next_participant(
             return number
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT_NUMBER:
-        raise DrakeTeleopError(
-            f"all participant numbers from 1 to {MAX_PARTICIPANT_NUMBER} are used",
-            where=str(store.folder),
-            remedy="choose another folder",
-        )
+        what = f"all participant numbers from 1 to {MAX_PARTICIPANT_NUMBER} are used"
+        raise DrakeTeleopError(what, where=str(store.folder), remedy="choose another folder")
     return number
 
 

@@ -334,11 +334,8 @@ def _read_arm_kinematics_from_options(
         refuse_without_model({"--sensor-frame": sensor_frame, "--package-path": package_paths})
         return None
     if sensor_frame is None:
-        raise DrakeTeleopError(
-            "is required with --model",
-            where="--sensor-frame",
-            remedy="name the frame or link at which the sensor measures",
-        )
+        remedy = "name the frame or link at which the sensor measures"
+        raise DrakeTeleopError("is required with --model", where="--sensor-frame", remedy=remedy)
     from drake_teleop.station.slave.plant import read_arm_without_default_limits
 
     return read_arm_without_default_limits(model, sensor_frame, package_paths)

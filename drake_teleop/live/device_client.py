@@ -153,11 +153,8 @@ def open_device(address: str, grip: str, depth: float) -> HapticDevice:
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
-    raise DrakeTeleopError(
-        "is not the address of a haptic device",
-        where=address,
-        remedy="use virtual or haply://HOST:PORT",
-    )
+    remedy = "use virtual or haply://HOST:PORT"
+    raise DrakeTeleopError("is not the address of a haptic device", where=address, remedy=remedy)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -176,10 +173,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     end, largest = time.perf_counter() + options.seconds, 0.0
     try:
         while time.perf_counter() < end:
-            largest = max(
-                largest,
-                float(np.linalg.norm((client.exchange_packets() or (0.0,) * 3)[:3])),
-            )
+            wrench = client.exchange_packets() or (0.0,) * 6
+            largest = max(largest, float(np.linalg.norm(wrench[:3])))
     except KeyboardInterrupt:
         pass
     finally:

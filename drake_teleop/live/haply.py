@@ -87,9 +87,8 @@ class HaplyDevice:
             )
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
-            raise DrakeTeleopError(
-                f"Haply's service does not answer ({error})", where=address, remedy="start it"
-            ) from error
+            what = f"Haply's service does not answer ({error})"
+            raise DrakeTeleopError(what, where=address, remedy="start it") from error
         self._device = ""
 
     def read(self) -> DevicePose | None:
@@ -100,11 +99,8 @@ class HaplyDevice:
         except TimeoutError:
             return None
         except ConnectionClosed as error:
-            raise DrakeTeleopError(
-                "Haply's service has closed the connection",
-                where="haply",
-                remedy="restart the service",
-            ) from error
+            what = "Haply's service has closed the connection"
+            raise DrakeTeleopError(what, where="haply", remedy="restart the service") from error
         if message is None:
             return None
         self._device, state = message

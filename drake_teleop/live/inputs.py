@@ -214,11 +214,9 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     if tuple(lines[0]) == _CSV_COLUMNS:
         raise _not_repeatable("does not contain the version of drake_teleop that wrote it", path)
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
-        raise DrakeTeleopError(
-            "does not contain the inputs of a recorded live session",
-            where=str(path),
-            remedy=f"use the columns {', '.join(_CSV_COLUMNS)}",
-        )
+        what = "does not contain the inputs of a recorded live session"
+        remedy = f"use the columns {', '.join(_CSV_COLUMNS)}"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
         if recorded.get(name) != value:
@@ -227,9 +225,8 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             raise _not_repeatable(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError(
-            "has a duration of 0 s", where=str(path), remedy="record the session again"
-        )
+        remedy = "record the session again"
+        raise DrakeTeleopError("has a duration of 0 s", where=str(path), remedy=remedy)
     return changes
 
 

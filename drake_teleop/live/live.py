@@ -44,7 +44,6 @@ MIN_DISPLAYED_TOUCH_FORCE_N = 0.12
 # of messages.
 _MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
 _MIN_SHOWN_UNRENDERED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_RELEASED_HAND_INPUTS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _SESSION_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
@@ -159,7 +158,7 @@ class Live:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._requested = self._requested.with_changes(_RELEASED_HAND_INPUTS)
+            self._requested = self._requested.with_changes({"held": 0, "clutch": 0})
             self._rates = RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
@@ -339,7 +338,7 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None."""
+    """Return the valid requests in a message of the page or the experiment's page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:
@@ -359,7 +358,9 @@ def parse_message(text: Any) -> dict[str, Any] | None:
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
     if isinstance(message.get("scene"), str) and message["scene"] in SCENE_NAMES:
         found["scene"] = message["scene"]
-    found |= {name: True for name in ("reset", "drive") if message.get(name) is True}
+    found |= {name: True for name in ("reset", "drive", "go") if message.get(name) is True}
+    if type(message.get("answer")) is int and message["answer"] in (1, 2):
+        found["answer"] = message["answer"]
     return found or None
 
 

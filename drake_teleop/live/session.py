@@ -370,10 +370,8 @@ def read_drive(folder: str | Path) -> RecordedDrive:
     load = read_cached_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):
-        raise DrakeTeleopError(
-            "is not an identified load (16 finite parameters)",
-            where=str(folder / LOAD_FILE),
-            remedy="record the session again",
-        )
+        what = "is not an identified load (16 finite parameters)"
+        remedy = "record the session again"
+        raise DrakeTeleopError(what, where=str(folder / LOAD_FILE), remedy=remedy)
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return RecordedDrive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

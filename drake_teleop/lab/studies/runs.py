@@ -66,11 +66,8 @@ def run_study(
 
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":
-        raise DrakeTeleopError(
-            "an adaptive design has no shards, because its points depend on earlier runs",
-            where="study",
-            remedy="use jobs, cluster or executor",
-        )
+        what = "an adaptive design has no shards, because its points depend on earlier runs"
+        raise DrakeTeleopError(what, where="study", remedy="use jobs, cluster or executor")
     points = study.points()
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
@@ -89,15 +86,15 @@ def run_study(
         try:
             with (
                 show_progress(progress) as stage,
-                open_executor(store, jobs, cluster, executor) as workers,
+                open_executor(store, jobs, cluster, executor) as (num_workers, run_chunks),
             ):
-                counter.start(stage("Study"), workers.num_workers)
+                counter.start(stage("Study"), num_workers)
                 new = points
                 while new:
                     finished = store.first_runs_of_finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
-                    for found in workers.run_chunks(run, left):
+                    for found in run_chunks(run, left):
                         columns = {name: [row.get(name) for row in found] for name in schema}
                         store.write(pl.DataFrame(columns, schema=schema))
                         counter.add_finished_runs(found)

@@ -118,9 +118,8 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise DrakeTeleopError(
-                "is in use by another process", where=str(out), remedy="wait for it, or stop it"
-            ) from None
+            what = "is in use by another process"
+            raise DrakeTeleopError(what, where=str(out), remedy="wait for it, or stop it") from None
         write_or_check_identity(out, identity)
         yield
     finally:
@@ -134,8 +133,6 @@ def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
     if not path.exists():
         write_text(path, text)
     elif path.read_bytes() != text.encode():
-        raise DrakeTeleopError(
-            "contains runs of another study, or of another version of this one",
-            where=str(out),
-            remedy="give another folder, or remove this one",
-        )
+        what = "contains runs of another study, or of another version of this one"
+        remedy = "give another folder, or remove this one"
+        raise DrakeTeleopError(what, where=str(out), remedy=remedy)

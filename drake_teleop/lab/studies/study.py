@@ -88,11 +88,8 @@ def study_command(
         ("cluster", "executor", cluster and executor is not None),
     ):
         if both:
-            raise DrakeTeleopError(
-                f"the options {first} and {second} cannot be combined",
-                where="study",
-                remedy="remove one of them",
-            )
+            what = f"the options {first} and {second} cannot be combined"
+            raise DrakeTeleopError(what, where="study", remedy="remove one of them")
     study, path = LoadStudy(path), find_shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_num_runs(str(path), yes)

@@ -110,11 +110,9 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
-        raise DrakeTeleopError(
-            "no settings were stable for all given hands and walls",
-            where="tune",
-            remedy="state firmer hands, softer walls or a faster network",
-        )
+        what = "no settings were stable for all given hands and walls"
+        remedy = "state firmer hands, softer walls or a faster network"
+        raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
     larger = dataclasses.replace(chosen, gamma=BEYOND_MARGIN_FACTOR * margin * chosen.gamma)
     beyond = execute("larger_gamma", _study_of_settings(larger, ends, [stiffest], repeats=2), trial)

@@ -234,23 +234,11 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of the experiment's page, or None."""
+    """Return the valid requests that participants may make, or None."""
     message = parse_message(text) or {}
-    found: dict[str, Any] = {}
+    found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:
         found[kind] = {
             name: value for name, value in message[kind].items() if name in PARTICIPANT_INPUTS
         }
-    if "drive" in message:
-        found["drive"] = True
-    try:
-        whole = json.loads(text) if isinstance(text, str) and len(text) < 100 else None
-    except (ValueError, RecursionError):
-        whole = None
-    if isinstance(whole, dict):
-        if whole.get("go") is True:
-            found["go"] = True
-        answer = whole.get("answer")
-        if isinstance(answer, int) and not isinstance(answer, bool) and answer in (1, 2):
-            found["answer"] = answer
     return found or None

@@ -76,11 +76,8 @@ def serve_experiment(
     done, trials = live.procedure.trial_number, len(live.procedure.trials)
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
-        raise DrakeTeleopError(
-            f"the simulation has stopped: {live.ended}; {what}",
-            where="drive",
-            remedy="run the same command again to continue",
-        )
+        what = f"the simulation has stopped: {live.ended}; {what}"
+        raise DrakeTeleopError(what, where="drive", remedy="run the same command again to continue")
     if done < trials:
         raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
     print(f"\nended by {reason}: {what}")
