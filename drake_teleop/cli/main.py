@@ -159,8 +159,8 @@ def drive(
         return
     option.refuse_given_options("record", remedy="remove it: --results contains the recording")
     if simulated:
-        names = ("participant", "port", "no_browser", "device")
-        option.refuse_given_options(*names, remedy="remove it or --simulated")
+        unused = ("participant", "port", "no_browser", "device")
+        option.refuse_given_options(*unused, remedy="remove it or --simulated")
     from drake_teleop.cli.experiment import experiment_command
 
     experiment_command(study, results, participant=participant, simulated=simulated, **options)

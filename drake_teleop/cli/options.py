@@ -272,8 +272,8 @@ def separate_sigmas(command: Any) -> Any:
 
 
 def rate_hz(text: str, *, required: bool = False) -> Callable[[Any], Any]:
-    named = {"type": POSITIVE_TYPE, "metavar": "HZ", "required": required, "help": text}
-    return click.option("--rate", "rate_hz", **named)
+    names = ("--rate", "rate_hz")
+    return click.option(*names, type=POSITIVE_TYPE, required=required, metavar="HZ", help=text)
 
 
 def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:

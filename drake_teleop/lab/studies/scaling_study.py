@@ -7,6 +7,7 @@ sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,20 +82,16 @@ def scaling_study_command(
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    sigmas, gammas = _sigmas_and_gammas()
     answers = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {
-            selection: _find_best_scales(found, sigmas, gammas)
-            for selection, found in answers.items()
-        },
+        "choice": {selection: _find_best_scales(found) for selection, found in answers.items()},
         "eta": _eta_effects(rows[_ETA_STUDY_NAME]),
     }
     with output_folder(out, "answer.json"):
-        write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
-        write_picture(out / "answer.png", draw_criteria(rows, sigmas, gammas))
-        write_picture(out / "choice.png", draw_best_scales(answers, sigmas, gammas))
+        write_table(out / "answer.csv", _merit_table(answers))
+        write_picture(out / "answer.png", draw_criteria(rows))
+        write_picture(out / "choice.png", draw_best_scales(answers, *_sigmas_and_gammas()))
         write_json(out / "answer.json", summary)
     if not quiet:
         _print_best_scales(summary, out)
@@ -142,6 +139,7 @@ def _means_over_unscaled(table: Array, weights: Array) -> Array:
     return means / means[:, -1, _sigmas_and_gammas()[1].index(1.0), None, None]  # sigma = gamma = 1
 
 
+@cache
 def _sigmas_and_gammas() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
     return factors[_SIGMA_KEY], factors[_GAMMA_KEY]
@@ -162,11 +160,10 @@ def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _find_best_scales(
-    found: ScaleRating, sigmas: list[float], gammas: list[float]
-) -> dict[str, Any] | None:
+def _find_best_scales(found: ScaleRating) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
+    sigmas, gammas = _sigmas_and_gammas()
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
     near = np.argwhere(found.best_share >= _MIN_SHARE_OF_DRAWS_AS_BEST)
     return {
@@ -183,11 +180,10 @@ def _find_best_scales(
     }
 
 
-def _merit_table(
-    answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
-) -> pl.DataFrame:
+def _merit_table(answers: dict[str, ScaleRating]) -> pl.DataFrame:
     import polars as pl
 
+    sigmas, gammas = _sigmas_and_gammas()
     return pl.DataFrame(
         [
             {
@@ -218,9 +214,8 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return table
 
 
-def draw_criteria(
-    rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
-) -> Figure:
+def draw_criteria(rows: dict[str, pl.DataFrame]) -> Figure:
+    sigmas, gammas = _sigmas_and_gammas()
     tasks = [task for task in TASK_CRITERIA if "force" in TASK_CRITERIA[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
