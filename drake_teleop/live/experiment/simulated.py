@@ -34,7 +34,7 @@ from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
-from drake_teleop.station.task_measures import task_measures, true_contact_force_magnitudes
+from drake_teleop.station.task_measures import task_measures
 
 # Start of the hand's motion [s].
 _HAND_MOTION_START_S = 0.4
@@ -147,5 +147,6 @@ def _insert_peg(apparatus: Apparatus, base: Scenario, procedure: Procedure) -> I
     measures = task_measures(result, scenario)
     done = measures["success"] > 0.0
     time_s = measures["task_time_s"] if done else task.timeout
-    force = float(true_contact_force_magnitudes(result).max())
-    return IntervalResult(force_N=force, done=done, time_s=time_s)
+    rows = IntervalLog(scenario, None)
+    rows.add_rows({"t": result.t} | {name: result[name] for name in result.signals})
+    return IntervalResult(force_N=rows.largest_mean_contact_force(), done=done, time_s=time_s)
