@@ -77,6 +77,8 @@ class FiniteNumber(click.FloatRange):
 
 
 class IntegerInRange(click.IntRange):
+    """Parameter type of integers in a range."""
+
     name = "integer"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> int:
@@ -86,6 +88,8 @@ class IntegerInRange(click.IntRange):
 
 
 class DelayOrAuto(click.ParamType):
+    """Parameter type: seconds or "auto"."""
+
     name = "auto|SECONDS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:

@@ -38,7 +38,7 @@ def force_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work of the hand, and of the tool's force on its contacts, to `energy` (2,) [J]."""
+    # `energy` [J]: work of the hand on the stylus, and of the tool's force on its contacts.
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -55,6 +55,8 @@ def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist,
 
 
 class PageValueCalculator:
+    """Calculator of the page's values from rows of the log."""
+
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints

@@ -39,6 +39,8 @@ _MAX_STORED_FORCE_AGES = 100_000  # ticks
 
 
 class HapticDevice(Protocol):
+    """Interface of a haptic device."""
+
     @property
     def limits(self) -> DeviceLimits: ...
 
@@ -122,6 +124,8 @@ class DeviceClient:
 
 
 class RealTimeVirtualDevice:
+    """Virtual device that runs in real time."""
+
     limits = DeviceLimits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:

@@ -68,6 +68,8 @@ def _require_finite_float(value: Any) -> float:
 
 
 class HaplyDevice:
+    """Haply Inverse3 at haply://HOST:PORT."""
+
     limits = DeviceLimits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
 
     def __init__(self, address: str) -> None:

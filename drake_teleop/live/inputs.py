@@ -132,7 +132,6 @@ class Inputs:
 
     @property
     def channel_choices(self) -> tuple[int, ...]:
-        """Inputs that determine channel and passivity method."""
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:

@@ -338,7 +338,7 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message of the page or the experiment's page, or None."""
+    """Return the valid requests in a message of either page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

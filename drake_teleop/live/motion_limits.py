@@ -17,6 +17,8 @@ _TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
+    """Integrator of rates (of keys, sticks) in simulated time."""
+
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
         self._at: dict[str, float] = {}

@@ -151,7 +151,7 @@ class LiveDrive:
             thread.join()
 
     def _stop_threads_or_exit_process(self) -> None:
-        """Stop all threads; Python may crash at exit while compiled code runs."""
+        # Python may crash at exit while compiled code runs.
         self._stop.set()
         end = time.monotonic() + _THREAD_END_TIMEOUT_S
         for thread in self._threads:

@@ -128,6 +128,8 @@ def _mean_objectives(study: Study, store: Store, points: int) -> Array:
 
 
 class StudyProgress:
+    """Finished runs and remaining time of a study."""
+
     def __init__(self, total: int) -> None:
         self.total, self.done, self._num_timed = total, 0, 0
         self._recent: deque[float] = deque(maxlen=_NUM_RUNS_FOR_TIME_ESTIMATE)

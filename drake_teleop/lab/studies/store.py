@@ -34,7 +34,6 @@ class Store:
         return set(map(_first_run_of_part, self.part_files()))
 
     def part_files(self) -> list[Path]:
-        """Return the files of the stored chunks, sorted by run."""
         return sorted(self.folder.glob(_PART_FILE_NAME.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
@@ -59,7 +58,6 @@ class Store:
         (self._start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
     def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
-        """Return the first runs of unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
@@ -68,7 +66,6 @@ class Store:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:
-        """Return all rows, sorted by run."""
         import polars as pl
 
         remedy = "remove the damaged part and repeat the command"

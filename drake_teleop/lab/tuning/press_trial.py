@@ -59,6 +59,8 @@ GIVEN_SETTINGS_NAME = "as given"
 
 @dataclass(frozen=True)
 class TunedSettings:
+    """Settings that `tune` chooses."""
+
     method: str
     gamma: float
     sigma_inertia: float

@@ -167,7 +167,7 @@ class GuidedExperiment:
 
     @property
     def ms(self) -> int:
-        """Simulated time since the present interval of the trial began [ms]."""
+        """Simulated time of the present interval [ms]."""
         return self._live.ms
 
     @property

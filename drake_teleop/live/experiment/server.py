@@ -21,6 +21,8 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
+    """Live session of one participant, with its server."""
+
     def __init__(
         self,
         experiment: Experiment,

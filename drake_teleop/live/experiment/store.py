@@ -58,6 +58,8 @@ _TRIAL_SCHEMA = table_schema(TrialRow)
 
 @dataclass(frozen=True)
 class TrialStore:
+    """Folder with an experiment's trials."""
+
     folder: Path
 
     def participant_file(self, participant: int) -> Path:
