@@ -153,10 +153,7 @@ def draw_settling(looks: list[RecordEvaluation], tolerance: Tolerance) -> Figure
                 axes.axvline(x, color=GREY, linewidth=0.6)
                 words = at.advice.split(",")[0].split(":")[0].replace(" the wrist", "")
                 axes.text(x, 0.02, words, rotation=90, size=7, transform=transform)
-        axes.set(
-            title="Half-width of the 95 % interval over the tolerance",
-            xlabel="length of the record [s]",
-            yscale="log",
-        )
+        axes.set_title("Half-width of the 95 % interval over the tolerance")
+        axes.set(xlabel="length of the record [s]", yscale="log")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

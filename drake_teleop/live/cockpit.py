@@ -79,15 +79,11 @@ class PageValueCalculator:
         force_range_into(rows["force_to_master"], zeros, rendered)
         touches = rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         self._forces[:2] *= inputs.force_scales["force_scale"]
+        t, states, hand, twist = (
+            rows[name] for name in ("t", "slave_state", "hand_wrench_E", "twist_master")
+        )
         _integrate_hand_and_contact_work(
-            self._table,
-            rows["t"],
-            rows["slave_state"],
-            contact_S,
-            rows["hand_wrench_E"],
-            rows["twist_master"],
-            self._last_row,
-            self._energy,
+            self._table, t, states, contact_S, hand, twist, self._last_row, self._energy
         )
         return {
             "f": [_rounded_or_zero(pair, 4) for pair in self._forces],

@@ -84,12 +84,9 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         )
     name = NETWORKS[inputs.network]
     if name == "custom":
-        changes["channel"] = Channel(
-            delay=_DELAY_INPUT_UNIT_S * inputs.delay,
-            jitter=_JITTER_INPUT_UNIT * inputs.jitter,
-            distribution="gamma",
-            loss=_LOSS_INPUT_UNIT * inputs.loss,
-        )
+        delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
+        loss = _LOSS_INPUT_UNIT * inputs.loss
+        changes["channel"] = Channel(delay=delay, jitter=jitter, distribution="gamma", loss=loss)
     elif name != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:

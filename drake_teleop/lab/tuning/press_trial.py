@@ -77,14 +77,8 @@ class TunedSettings:
         sensor = base.wrist_sensor
         if not sensor.ideal:
             sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
-        scaling = dataclasses.replace(
-            base.force_scaling,
-            sigma=0.0,
-            eta=None,
-            gamma=self.gamma,
-            sigma_weight=0.0,
-            sigma_inertia=self.sigma_inertia,
-        )
+        scaling = dataclasses.replace(base.force_scaling, sigma=0.0, eta=None, sigma_weight=0.0)
+        scaling = dataclasses.replace(scaling, gamma=self.gamma, sigma_inertia=self.sigma_inertia)
         return replace(
             base, wrist_sensor=sensor, force_scaling=scaling, passivity=self.passivity(stated)
         )
@@ -226,14 +220,9 @@ class OneAxisGammaSearch:
         ideal = self.base_scenario.wrist_sensor.ideal
         added = 0.0 if ideal else _FILTER_DELAY_CYCLES / settings.low_pass_hz
         task = short_press_task(forward.delay + backward.delay)
-        run = run_one_dof(
-            model,
-            settings.passivity(self.stated_set),
-            forward,
-            dataclasses.replace(backward, delay=backward.delay + added),
-            seed=seed,
-            intent=operator_intent(task),
-        )
+        passivity, intent = settings.passivity(self.stated_set), operator_intent(task)
+        filtered = dataclasses.replace(backward, delay=backward.delay + added)
+        run = run_one_dof(model, passivity, forward, filtered, seed=seed, intent=intent)
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release_start - task.rest_window) & (run.t < task.release_start)
         force, period = run.hand_force[hold], run.t[1] - run.t[0]

@@ -96,11 +96,9 @@ def tune(
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
         write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
+        url = png_data_url(out / "trade_off.png")
         page = render_page(
-            "drake_teleop.lab.tuning",
-            "report.html.j2",
-            summary=summary,
-            picture=png_data_url(out / "trade_off.png"),
+            "drake_teleop.lab.tuning", "report.html.j2", summary=summary, picture=url
         )
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
